@@ -1,0 +1,33 @@
+"""Settings of a line as the engine needs them; `service/config.py` makes them from the TOML."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class PollSettings:
+    """How often values are wanted; the line decides what is possible."""
+
+    live_s: float = 1.0
+    settings_s: float = 300.0
+
+
+@dataclass(frozen=True, slots=True)
+class LineSettings:
+    """One serial line."""
+
+    name: str
+    index: int  # 1-based position in the configuration; the MIB's lineIndex
+    port: str
+    baudrate: int = 9600
+    bytesize: int = 8
+    parity: str = "N"
+    stopbits: int = 2
+    reply_timeout_s: float = 0.5  # from the end of the request to the first byte that is due
+    retries: int = 2  # for client reads; a missed poll waits for its next turn
+    quarantine_s: float = 0.1  # silence asked for after a failure before the line is used again
+    gap_s: float = 0.0  # extra silence between frames for slow devices; never below 3.5 characters
+    queue_limit: int = 64  # waiting client reads; over it exception 06
+    queue_limit_s: float = 5.0  # a client read that waited longer is answered 0B
+    poll: PollSettings = PollSettings()

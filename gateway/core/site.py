@@ -1,0 +1,117 @@
+"""The site: lines and devices as the faces see them.
+
+A face holds a `Site`, looks devices up by unit id, reads `device.snapshot` and, when memory is not
+enough, asks `device.line.read(...)`. It never sees a serial port.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from types import MappingProxyType
+from typing import Protocol
+
+from gateway.core.snapshot import Snapshot
+from gateway.core.stats import DeviceStats, LineStats
+from gateway.devices.model import DeviceMap
+from gateway.errors import RequestError
+
+Outcome = bytes | RequestError
+"""How a request ended: the reply PDU (may be the device's own exception) or why there is none."""
+
+
+class LineState(StrEnum):
+    """Whether the port is open."""
+
+    DOWN = "down"
+    OPEN = "open"
+
+
+@dataclass(frozen=True, slots=True)
+class LineStatus:
+    """A line at one moment."""
+
+    state: LineState
+    since: float  # monotonic
+    error: str  # why it is down; "" when open
+    queue_depth: int
+    use_ratio: float  # share of the last minute in which a transaction was on the wire, 0..1
+
+
+class Ticket(Protocol):
+    """A read that is under way for somebody."""
+
+    def cancel(self) -> None:
+        """The asker is gone: `done` will not be called. Others who share the read are not affected."""
+        ...
+
+
+class LinePort(Protocol):
+    """A line as the faces and the history see it."""
+
+    @property
+    def name(self) -> str:
+        """The configured name."""
+        ...
+
+    @property
+    def index(self) -> int:
+        """1-based position in the configuration; the MIB's lineIndex."""
+        ...
+
+    @property
+    def port(self) -> str:
+        """The configured port, for people."""
+        ...
+
+    @property
+    def stats(self) -> LineStats:
+        """Counters since start."""
+        ...
+
+    def status(self, now: float) -> LineStatus:
+        """State, queue and use at `now`."""
+        ...
+
+    def read(self, device: Device, pdu: bytes, done: Callable[[Outcome], None]) -> Ticket:
+        """Ask the line for one read.
+
+        `done` is called exactly once, from the event loop and never before `read` returns, unless the
+        ticket was cancelled. Identical reads that wait for the same device share one transaction.
+        """
+        ...
+
+
+@dataclass(slots=True, eq=False)
+class Device:
+    """A controller on a line. Only its line replaces `snapshot`."""
+
+    name: str
+    unit_id: int
+    address: int
+    map: DeviceMap
+    decode: Mapping[str, str] = field(default_factory=dict)  # point name → reading name
+    line: LinePort = field(init=False)
+    snapshot: Snapshot = field(default_factory=Snapshot)
+    stats: DeviceStats = field(default_factory=DeviceStats)
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """Everything that is configured south of the faces."""
+
+    name: str
+    lines: tuple[LinePort, ...]
+    devices: tuple[Device, ...]  # ascending unit id
+    by_unit: Mapping[int, Device]
+
+    @classmethod
+    def of(cls, name: str, lines: Sequence[LinePort], devices: Sequence[Device]) -> Site:
+        """Build the site; ValueError when two devices have one unit id."""
+        by_unit = {device.unit_id: device for device in devices}
+        if len(by_unit) != len(devices):
+            message = "unit ids are not unique"
+            raise ValueError(message)
+        ordered = tuple(sorted(devices, key=lambda device: device.unit_id))
+        return cls(name, tuple(lines), ordered, MappingProxyType(by_unit))

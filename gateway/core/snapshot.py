@@ -1,0 +1,67 @@
+"""Immutable values of one device with their times.
+
+A snapshot is replaced whole and never changed, so a face that holds one sees one consistent state.
+All times are monotonic seconds. `Block.read_at` is when the request went out: the values are at
+most that old, never older than stated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from types import MappingProxyType
+
+from gateway.devices.model import Identification, Space, Value
+
+
+class DeviceState(StrEnum):
+    """Quality of everything a device shows (design §7)."""
+
+    UNKNOWN = "unknown"  # not one reply since start
+    ONLINE = "online"
+    STALE = "stale"  # three misses
+    OFFLINE = "offline"  # quarantined, probed with back-off
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """One contiguous read: registers as big-endian words, coils packed as in a reply (bit 0 first)."""
+
+    space: Space
+    first: int
+    count: int
+    data: bytes
+    read_at: float
+
+
+_NO_VALUES: Mapping[str, Value] = MappingProxyType({})
+_NO_TIMES: Mapping[str, float] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """State and last values of a device.
+
+    `values` has only points that have a value (NaN, infinity and absent sensors are left out) and is kept
+    while the device is stale so that a `hold` policy is possible; faces use `shown()`.
+    """
+
+    version: int = 0
+    state: DeviceState = DeviceState.UNKNOWN
+    state_since: float = 0.0
+    last_reply_at: float | None = None
+    blocks: tuple[Block, ...] = ()
+    values: Mapping[str, Value] = field(default=_NO_VALUES)
+    read_at: Mapping[str, float] = field(default=_NO_TIMES)  # point name → its block's read_at
+    identification: Identification | None = None
+    serial_number: str | None = None
+
+    def shown(self) -> Mapping[str, Value]:
+        """Values that a face may show now: all of an online device, none of any other."""
+        return self.values if self.state is DeviceState.ONLINE else _NO_VALUES
+
+    def age_s(self, point: str, now: float) -> float | None:
+        """Age of a point's value in seconds, or None when it was never read."""
+        at = self.read_at.get(point)
+        return None if at is None else max(0.0, now - at)

@@ -1,0 +1,51 @@
+"""Counters, written by the engine and the faces and read by every face.
+
+Plain mutable numbers on one loop: an increment is the whole cost.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+from gateway.modbus.counters import RtuCounters
+
+
+@dataclass(slots=True)
+class LineStats:
+    """What a line did since start. `sent` = `ok` + the sum of `failed` + the one on the wire."""
+
+    sent: int = 0
+    ok: int = 0
+    failed: Counter[str] = field(default_factory=Counter)  # error label → count, incl. "exception"
+    retries: int = 0
+    polls: int = 0
+    client_reads: int = 0
+    opens: int = 0
+    busy_s: float = 0.0  # time the line was occupied by a transaction
+    wire: RtuCounters = field(default_factory=RtuCounters)
+
+
+@dataclass(slots=True)
+class DeviceStats:
+    """What was asked of a device since start."""
+
+    polls: int = 0
+    failures: int = 0
+    exceptions: int = 0
+    went_offline: int = 0
+    implausible: int = 0
+
+
+@dataclass(slots=True)
+class ModbusServerStats:
+    """The Modbus TCP face since start."""
+
+    connections: int = 0
+    open_connections: int = 0
+    refused_connections: int = 0
+    requests: int = 0
+    cache_hits: int = 0
+    forwarded: int = 0
+    exceptions: Counter[int] = field(default_factory=Counter)  # exception code → count
+    malformed: Counter[str] = field(default_factory=Counter)  # reason → count

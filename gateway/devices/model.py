@@ -1,0 +1,222 @@
+"""What a device map says, as frozen data.
+
+A map (`maps/<model>.toml`) is read by `devices/schema.py` into these classes; everything that knows a
+register (decoding, poll plan, MIB, metrics, documentation, simulator) reads them from here.
+
+Addresses are PDU addresses (0-based), never logical ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+Value = float | int
+"""A decoded value: float for measured points, int for counters, enumerations and bit fields. No value is `None`."""
+
+
+class Space(StrEnum):
+    """An address space of the device; the map names the functions that read it."""
+
+    REGISTERS = "registers"
+    COILS = "coils"
+
+
+class WordOrder(StrEnum):
+    """Which word of a 32-bit pair has the lower address."""
+
+    HI_LO = "hi-lo"
+    LO_HI = "lo-hi"
+
+
+class Access(StrEnum):
+    """What the device lets a client do with a point."""
+
+    READ = "read"
+    WRITE = "write"  # and read
+    SET = "set"  # set only, always reads 0
+
+
+class Group(StrEnum):
+    """What a point is about; decides its poll class and its MIB table."""
+
+    LIVE = "live"
+    ENERGY = "energy"
+    TODAY = "today"
+    SETTINGS = "settings"
+    COMMAND = "command"  # coils and registers that only make sense to write; never polled
+
+
+class PollClass(StrEnum):
+    """How often a block is read."""
+
+    LIVE = "live"
+    SETTINGS = "settings"
+    BACKGROUND = "background"  # the daily log: read by history/, never by the poll plan
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """A run of addresses that the device answers; outside of all extents it answers exception 02."""
+
+    name: str
+    space: Space
+    first: int
+    last: int
+    poll: PollClass
+    writable: bool
+    doc: str
+
+    @property
+    def count(self) -> int:
+        """Number of registers or coils."""
+        return self.last - self.first + 1
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One way to read the words of a point (the document's, or one seen in the field)."""
+
+    name: str
+    codec: str  # a name in devices/codecs.py
+    order: WordOrder
+    scale: float  # value = raw × scale
+    evidence: str
+
+
+@dataclass(frozen=True, slots=True)
+class MibColumn:
+    """The point's cell in the MIB; numbers are append-only (mibs/oids.lock)."""
+
+    column: int
+    scale: int  # SNMP integer = round(value × scale)
+    units: str  # UNITS clause; "" for enumerations and bit fields
+    syntax: str  # "Integer32", "Unsigned32", "Enumeration" or "Bits"
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A named value of a device.
+
+    `readings[0]` is the document's reading and the default; a device may choose another by name.
+    """
+
+    name: str  # snake_case, shared between models: battery_voltage
+    space: Space
+    address: int
+    words: int
+    symbol: str  # the document's variable name: adc_vb_f_1m
+    group: Group
+    unit: str  # "V", "A", "W", "°C", "Ah", "kWh", "h", "s", "d", "Ω", "V/°C", "" …
+    help: str
+    doc: str  # where in the document
+    access: Access
+    readings: tuple[Reading, ...]
+    minimum: float | None
+    maximum: float | None
+    enumeration: str | None  # key of DeviceMap.enumerations
+    bits: str | None  # key of DeviceMap.bit_tables
+    confidence: str  # "documented" or "low"
+    mib: MibColumn | None
+    metric: str | None  # full metric name, None where none is made
+    metric_scale: float  # metric sample = value × metric_scale (kWh → Wh, min → s)
+
+    def reading(self, name: str | None = None) -> Reading:
+        """The reading called `name`, or the document's; KeyError when there is none of that name."""
+        if name is None:
+            return self.readings[0]
+        for reading in self.readings:
+            if reading.name == name:
+                return reading
+        raise KeyError(name)
+
+
+@dataclass(frozen=True, slots=True)
+class EnumValue:
+    """One value of an enumeration, by the device's own number."""
+
+    number: int
+    name: str  # snake_case label: night_check
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Bit:
+    """One named bit; bit 0 is the least significant."""
+
+    number: int
+    name: str  # snake_case label: battery_hvd
+    text: str
+    severity: str  # "info", "warning", "critical"
+
+
+@dataclass(frozen=True, slots=True)
+class LogField:
+    """One field of a daily-log block, by word offset."""
+
+    name: str
+    symbol: str
+    offset: int
+    words: int
+    codec: str
+    scale: float  # to base units (minutes → seconds)
+    unit: str
+    bits: str | None
+    help: str
+
+
+@dataclass(frozen=True, slots=True)
+class LogLayout:
+    """Where the daily log lies and how a block is built."""
+
+    first: int
+    blocks: int
+    block_words: int
+    fields: tuple[LogField, ...]
+    doc: str
+
+
+@dataclass(frozen=True, slots=True)
+class IdentityRules:
+    """How the model shows itself: Read Device Identification and an optional serial number."""
+
+    product_prefixes: tuple[str, ...]
+    product_codes: tuple[str, ...]
+    vendor: str
+    serial_first: int | None
+    serial_words: int
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceMap:
+    """One model, whole."""
+
+    model: str  # "prostar-mppt"
+    title: str
+    document: str
+    functions: Mapping[int, Space]  # read functions: 1 → coils, 3 → registers …
+    write_functions: Mapping[int, Space]  # 5 → coils, 6 → registers
+    extents: tuple[Extent, ...]
+    reserved: tuple[Extent, ...]
+    points: tuple[Point, ...]
+    enumerations: Mapping[str, tuple[EnumValue, ...]]
+    bit_tables: Mapping[str, tuple[Bit, ...]]
+    log: LogLayout | None
+    identity: IdentityRules
+
+    def point(self, name: str) -> Point:
+        """The point of that name; KeyError when the model has none."""
+        for point in self.points:
+            if point.name == name:
+                return point
+        raise KeyError(name)
+
+
+@dataclass(frozen=True, slots=True)
+class Identification:
+    """What Read Device Identification (2B/0E, basic, stream) gave."""
+
+    vendor: str
+    product: str
+    revision: str

@@ -1,0 +1,154 @@
+"""The one error tree.
+
+Every error that can end a request knows the Modbus exception code a TCP client is told
+(`exception_code`, design: the table in docs/behaviour.md) and the `label` under which it is counted.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class GatewayError(Exception):
+    """Root of every error this project raises on purpose."""
+
+    exception_code: ClassVar[int | None] = None
+    label: ClassVar[str] = "gateway"
+
+
+class RequestError(GatewayError):
+    """A Modbus request that ends without the device's own reply; always has an exception code."""
+
+    exception_code: ClassVar[int] = 0x04
+    label: ClassVar[str] = "request"
+
+
+class IllegalFunction(RequestError):
+    """Function unknown to the gateway, or refused by policy (exception 01)."""
+
+    exception_code = 0x01
+    label = "illegal_function"
+
+
+class IllegalDataAddress(RequestError):
+    """Range outside the address space (exception 02)."""
+
+    exception_code = 0x02
+    label = "illegal_data_address"
+
+
+class IllegalDataValue(RequestError):
+    """Quantity, byte count or PDU length is wrong (exception 03)."""
+
+    exception_code = 0x03
+    label = "illegal_data_value"
+
+
+class ReplyUnusable(RequestError):
+    """The device answered, but nothing that can be used (exception 04)."""
+
+    exception_code = 0x04
+    label = "reply_unusable"
+
+
+class ReplyCrcError(ReplyUnusable):
+    """A reply came with a wrong CRC."""
+
+    label = "crc"
+
+
+class ReplyMismatch(ReplyUnusable):
+    """A reply with a right CRC had the wrong function, byte count or shape."""
+
+    label = "mismatch"
+
+
+class Busy(RequestError):
+    """The gateway will not take the request now (exception 06)."""
+
+    exception_code = 0x06
+    label = "busy"
+
+
+class QueueFull(Busy):
+    """The queue of the client, device or line is full."""
+
+    label = "queue_full"
+
+
+class ShuttingDown(Busy):
+    """The gateway is stopping."""
+
+    label = "shutting_down"
+
+
+class PathUnavailable(RequestError):
+    """No way to the device (exception 0A)."""
+
+    exception_code = 0x0A
+    label = "path_unavailable"
+
+
+class UnitNotRouted(PathUnavailable):
+    """The unit id belongs to no configured device."""
+
+    label = "unit_not_routed"
+
+
+class LineDown(PathUnavailable):
+    """The serial line is not open."""
+
+    label = "line_down"
+
+
+class DeviceSilent(RequestError):
+    """The device gave no answer (exception 0B)."""
+
+    exception_code = 0x0B
+    label = "silent"
+
+
+class ReplyTimeout(DeviceSilent):
+    """No complete reply within the time-out, after all retries."""
+
+    label = "timeout"
+
+
+class DeviceOffline(DeviceSilent):
+    """The device is quarantined; refused at once, without waiting."""
+
+    label = "offline"
+
+
+class FramingLost(GatewayError):
+    """A byte stream can no longer be cut into frames; the connection must be closed."""
+
+    label = "framing_lost"
+
+
+class MapError(GatewayError):
+    """A device map is wrong; the message names the file and the entry."""
+
+    label = "map"
+
+
+class PortError(GatewayError):
+    """A serial port cannot be opened; the message names the port and why."""
+
+    label = "port"
+
+
+class ListenError(GatewayError):
+    """A face cannot listen; the message names the address and why."""
+
+    label = "listen"
+
+
+class ConfigError(GatewayError):
+    """A configuration is wrong. `problems` lists all of them, each with key path and what is allowed."""
+
+    label = "config"
+
+    def __init__(self, problems: tuple[str, ...]) -> None:
+        super().__init__("\n".join(problems))
+        self.problems = problems

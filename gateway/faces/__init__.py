@@ -1,0 +1,1 @@
+"""North: Modbus TCP, SNMP and HTTP, all served from snapshots."""

@@ -1,0 +1,1 @@
+"""From the map: MIB, metric list and register documentation."""

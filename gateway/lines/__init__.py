@@ -1,0 +1,1 @@
+"""South: the asyncio shells that own a serial port."""

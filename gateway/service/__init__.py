@@ -1,0 +1,1 @@
+"""Configuration, wiring and supervision: how it is put together."""

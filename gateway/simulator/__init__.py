@@ -1,0 +1,1 @@
+"""Simulated controllers on real ptys: the demo and the tests are built on it."""
