@@ -1,0 +1,59 @@
+"""What every test room may use: foreign programs, free ports, hypothesis profiles.
+
+Room-specific helpers live in the conftest.py of the room.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+from collections.abc import Callable
+
+import pytest
+from hypothesis import HealthCheck, settings
+
+# Deadlines measure the machine, not the code. CI replays the same examples on every run, so that a red
+# build means a changed product; a developer's run explores new ones.
+settings.register_profile("dev", deadline=None)
+settings.register_profile("ci", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("ci" if os.environ.get("CI") else "dev")
+
+SBIN = ("/usr/local/sbin", "/usr/sbin", "/sbin")
+"""Where Debian puts daemons; not in an ordinary user's PATH."""
+
+
+@pytest.fixture(scope="session")
+def peer() -> Callable[[str], str]:
+    """`peer("mbpoll")` is the path of a foreign program; skips when it is absent, fails when CI is set."""
+    search = os.pathsep.join([os.environ.get("PATH", os.defpath), *SBIN])
+
+    def find(name: str) -> str:
+        path = shutil.which(name, path=search)
+        if path is not None:
+            return path
+        reason = f"{name} is not installed; tests/peers/install.sh installs every peer"
+        if os.environ.get("CI"):
+            pytest.fail(f"{reason} (a missing peer is a failure because CI is set)")
+        pytest.skip(reason)
+
+    return find
+
+
+def _free_port(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@pytest.fixture
+def free_tcp_port() -> Callable[[], int]:
+    """A TCP port of 127.0.0.1 that was free a moment ago, for programs that cannot be given port 0."""
+    return lambda: _free_port(socket.SOCK_STREAM)
+
+
+@pytest.fixture
+def free_udp_port() -> Callable[[], int]:
+    """A UDP port of 127.0.0.1 that was free a moment ago, for programs that cannot be given port 0."""
+    return lambda: _free_port(socket.SOCK_DGRAM)
