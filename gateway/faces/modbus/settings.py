@@ -1,0 +1,26 @@
+"""Settings of the Modbus TCP face; `service/config.py` makes them from the TOML."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from ipaddress import IPv4Network, IPv6Network, ip_network
+
+Network = IPv4Network | IPv6Network
+
+LOOPBACK: tuple[Network, ...] = (ip_network("127.0.0.0/8"), ip_network("::1/128"))
+
+
+@dataclass(frozen=True, slots=True)
+class ModbusSettings:
+    """Who may connect, how many, and for how long the server waits for what."""
+
+    listen: tuple[tuple[str, int], ...] = (("127.0.0.1", 1502),)
+    max_connections: int = 64  # over it the longest idle connection makes room, else the newcomer goes
+    allow: tuple[Network, ...] = LOOPBACK
+    max_age_s: float = 5.0  # `[cache] max_age_s`: older is never served from memory
+    strict_map: bool = False  # True: exception 02 outside of the map without asking the device
+    idle_timeout_s: float = 600.0  # no request for so long: the connection is closed
+    frame_timeout_s: float = 5.0  # a request must be complete so long after its first byte
+    write_timeout_s: float = 10.0  # a client that reads no replies for so long is cut off
+    reply_timeout_s: float = 60.0  # last resort: a request still unanswered ends its connection
+    stop_grace_s: float = 2.0  # how long a stopping server waits for replies under way
