@@ -1,0 +1,116 @@
+# Everything a user or a developer does with a clone; `make help` lists it.
+#
+# A fresh Debian 12 with Python 3.11 needs nothing else: the environment in .venv is made from the locked
+# requirements (hashes checked) and made again when a lock file changes. Debian packages are installed only
+# where that is allowed (root, or sudo without a password); otherwise the missing ones are named.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+MAKEFLAGS += --no-builtin-rules --no-print-directory
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+JOBS := 2
+# A Python 3.11 or newer; `make PYTHON=/path/to/python3.12 test` chooses another.
+PYTHON ?=
+
+# $(call step,what,command): one line; the command's output is shown only when it fails.
+step = @printf '  %-34s' '$(1)'; log=$$(mktemp); trap 'rm -f "$$log"' EXIT; \
+	if ( $(2) ) >"$$log" 2>&1; then echo ok; else echo FAILED; cat "$$log"; exit 1; fi
+
+.PHONY: help
+help: ## Show this list.
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+.PHONY: demo
+demo: $(VENV)/.runtime ## Run three simulated controllers, the gateway and its three faces; Ctrl-C stops.
+	@tests/peers/install.sh mbpoll snmp curl || echo 'Going on: the demo runs, but some of the commands it prints are missing.'
+	@exec $(BIN)/python -m gateway demo
+
+.PHONY: test
+test: setup lint ## Set everything up, lint, and run the tests with coverage.
+	@$(BIN)/python -m pytest -m 'not long' -n $(JOBS) --cov --cov-report=
+
+.PHONY: test-long
+test-long: setup ## Run the long tier: whole simulated days.
+	@$(BIN)/python -m pytest -m long --timeout=3600
+
+.PHONY: coverage
+coverage: ## Show which lines the last `make test` did not reach.
+	@$(BIN)/python -m coverage report
+
+.PHONY: lint
+lint: $(VENV)/.dev ## Check style, types, the layers, and that derived files are current.
+	$(call step,style (ruff check),$(BIN)/ruff check .)
+	$(call step,format (ruff format),$(BIN)/ruff format --check --diff .)
+	$(call step,types (mypy),$(BIN)/mypy)
+	$(call step,layers (import-linter),$(BIN)/lint-imports)
+	$(call step,derived files (generate --check),$(BIN)/prostar-gateway generate --check)
+
+.PHONY: format
+format: $(VENV)/.dev ## Format the code and repair what ruff can repair.
+	@$(BIN)/ruff check --fix --quiet .
+	@$(BIN)/ruff format .
+
+.PHONY: bench
+bench: $(VENV)/.dev ## Measure against the peers and print a table of ratios.
+	@for bench in tests/bench/bench_*.py; do $(BIN)/python "$$bench"; done
+
+.PHONY: setup
+setup: $(VENV)/.dev ## Make .venv and install the foreign programs that tests talk to.
+	@tests/peers/install.sh || { status=$$?; \
+	  if [[ -n "$${CI:-}" || $$status -ne 3 ]]; then exit 1; fi; \
+	  echo 'Going on: tests that need them are skipped.'; }
+
+.PHONY: lock
+lock: $(VENV)/.dev ## Write requirements*.txt anew from pyproject.toml.
+	$(call step,requirements-dev.txt,$(PIP_COMPILE) --extra dev --output-file requirements-dev.txt pyproject.toml)
+	$(call step,requirements.txt,$(PIP_COMPILE) --constraint requirements-dev.txt --output-file requirements.txt pyproject.toml)
+
+# No index, host or option of the machine that locks gets into the files. What builds the project itself is
+# locked with it, so that installing it needs no network of its own. UPGRADE=1 takes the newest versions.
+PIP_COMPILE = $(BIN)/pip-compile --quiet --generate-hashes --strip-extras --allow-unsafe --no-header \
+	--no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-emit-options \
+	--build-deps-for editable --extra fast $(if $(UPGRADE),--upgrade)
+
+.PHONY: clean
+clean: ## Remove .venv and everything that was made by a tool.
+	@rm -rf $(VENV) build dist htmlcov .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache \
+	  .import_linter_cache *.egg-info
+	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The environment. Debian has Python without the module that makes environments; it is installed if it may be.
+$(BIN)/python:
+	@python=; \
+	for candidate in $(or $(PYTHON),python3.11 python3.12 python3.13 python3.14 python3); do \
+	  if "$$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then python=$$candidate; break; fi; \
+	done; \
+	if [[ -z $$python ]]; then \
+	  echo '$(if $(PYTHON),$(PYTHON) is not a Python,There is no Python) 3.11 or newer. Install one (apt-get install python3) or name it: make PYTHON=/path/to/python3.11' >&2; exit 1; \
+	fi; \
+	version=$$("$$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])'); \
+	if ! "$$python" -c 'import ensurepip, venv' 2>/dev/null; then \
+	  tests/peers/install.sh "python$$version-venv" || { \
+	    echo "$$python cannot make a virtual environment: python$$version-venv is missing (apt-get install python$$version-venv)." >&2; exit 1; }; \
+	fi; \
+	echo "Making $(VENV) with Python $$version"; \
+	rm -rf $(VENV); "$$python" -m venv $(VENV)
+
+# $(call install,lock file): the locked packages, then this clone itself, editable.
+define install
+	@echo 'Installing $(1)'
+	@$(PIP) install --require-hashes --requirement $(1)
+	@$(PIP) install --no-deps --no-build-isolation --editable .
+endef
+
+# Order-only: a newer interpreter link is no reason to install again.
+$(VENV)/.runtime: requirements.txt pyproject.toml | $(BIN)/python
+	$(call install,requirements.txt)
+	@touch $@
+
+$(VENV)/.dev: requirements-dev.txt pyproject.toml | $(BIN)/python
+	$(call install,requirements-dev.txt)
+	@touch $@ $(VENV)/.runtime
