@@ -12,7 +12,7 @@ MAKEFLAGS += --no-builtin-rules --no-print-directory
 
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --quiet
 JOBS := 2
 # A Python 3.11 or newer; `make PYTHON=/path/to/python3.12 test` chooses another.
 PYTHON ?=
@@ -96,14 +96,13 @@ $(BIN)/python:
 	  tests/peers/install.sh "python$$version-venv" || { \
 	    echo "$$python cannot make a virtual environment: python$$version-venv is missing (apt-get install python$$version-venv)." >&2; exit 1; }; \
 	fi; \
-	echo "Making $(VENV) with Python $$version"; \
+	echo "Making $(VENV) with Python $$version:"; \
 	rm -rf $(VENV); "$$python" -m venv $(VENV)
 
 # $(call install,lock file): the locked packages, then this clone itself, editable.
 define install
-	@echo 'Installing $(1)'
-	@$(PIP) install --require-hashes --requirement $(1)
-	@$(PIP) install --no-deps --no-build-isolation --editable .
+	$(call step,install $(1),$(PIP) install --require-hashes --requirement $(1))
+	$(call step,install this clone,$(PIP) install --no-deps --no-build-isolation --editable .)
 endef
 
 # Order-only: a newer interpreter link is no reason to install again.
