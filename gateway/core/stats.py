@@ -49,3 +49,5 @@ class ModbusServerStats:
     forwarded: int = 0
     exceptions: Counter[int] = field(default_factory=Counter)  # exception code → count
     malformed: Counter[str] = field(default_factory=Counter)  # reason → count
+    refused: Counter[str] = field(default_factory=Counter)  # the policy's reason → count
+    closed: Counter[str] = field(default_factory=Counter)  # why the server ended a connection → count
