@@ -15,7 +15,8 @@ class ModbusSettings:
     """Who may connect, how many, and for how long the server waits for what."""
 
     listen: tuple[tuple[str, int], ...] = (("127.0.0.1", 1502),)
-    max_connections: int = 64  # over it the longest idle connection makes room, else the newcomer goes
+    max_connections: int = 64  # over it the longest idle connection makes room, else the newcomer is refused
+    evict_idle_s: float = 10.0  # only a connection that asked nothing for so long has to make room
     allow: tuple[Network, ...] = LOOPBACK
     max_age_s: float = 5.0  # `[cache] max_age_s`: older is never served from memory
     strict_map: bool = False  # True: exception 02 outside of the map without asking the device

@@ -1,0 +1,367 @@
+"""One Modbus TCP client.
+
+Rule 1: replies leave in the order of their requests. A request that waits for the line holds back
+        what came after it on this connection, and nothing on any other.
+Rule 2: nothing grows without bound. While `MAX_WAITING` replies are due, or `MAX_UNSENT` bytes
+        are not taken by the client, no further request is looked at and nothing is read.
+Rule 3: every request is answered, or its connection ends: framing lost or end of stream lets what came
+        before be answered first; a client that is gone has its questions withdrawn and gets nothing.
+Rule 4: no exception leaves this file. What was not foreseen is logged, counted, and ends the connection.
+
+The way in has two lanes. A whole request that `HotReplies` knows is answered in `data_received` with one
+lookup; everything else goes through the splitter and the dispatcher.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Callable
+from typing import cast
+
+from gateway.core.site import Outcome, Ticket
+from gateway.faces.modbus.dispatch import Dispatcher, Forward
+from gateway.faces.modbus.settings import ModbusSettings
+from gateway.faces.modbus.tcp import keep_alive
+from gateway.modbus.mbap import Adu, MbapSplitter
+
+logger = logging.getLogger(__name__)
+
+MAX_WAITING = 16
+MAX_UNSENT = 8192
+MAX_BURST = 64  # hot replies joined into one write
+READ_SIZE = 12  # a read request on the wire: MBAP 7, function, address, quantity
+PIECE = 2048  # how much of a long segment is cut into requests at a time
+TURN = 256  # requests looked at before other connections have their turn
+
+
+class _Due:
+    """A reply that has its place in the order and may not be there yet."""
+
+    __slots__ = ("forward", "reply", "since", "ticket", "tid")
+
+    def __init__(self, tid: bytes, since: float) -> None:
+        self.tid = tid
+        self.since = since
+        self.reply: bytes | None = None
+        self.forward: Forward | None = None
+        self.ticket: Ticket | None = None
+
+
+class Connection(asyncio.Protocol):
+    """The protocol of one connection; `left` is called once when it is over."""
+
+    def __init__(
+        self,
+        dispatcher: Dispatcher,
+        settings: ModbusSettings,
+        admit: Callable[[Connection, str], bool],
+        left: Callable[[Connection], None],
+    ) -> None:
+        self._dispatcher = dispatcher
+        self._settings = settings
+        self._admit = admit
+        self._left = left
+        self._stats = dispatcher.stats
+        self._find = dispatcher.hot.find
+        self._now = dispatcher.now
+        self._transport: asyncio.Transport | None = None
+        self._write: Callable[[bytes], None] = _nowhere
+        self._splitter = MbapSplitter()
+        self._foreign = 0  # ADUs with another protocol id, as far as they are counted
+        self._suspect = False  # the last ADUs had one: the splitter must see what comes next
+        self._input = b""  # received, not yet cut
+        self._adus: deque[Adu] = deque()  # cut, not yet answered
+        self._due: deque[_Due] = deque()
+        self._direct = False  # nothing is under way: a hot reply may be written at once
+        self._reading = True
+        self._ending = False  # no further request is taken; closes when all replies are out
+        self._over = False  # closed, or about to be
+        self._closing_since: float | None = None
+        self._resume: asyncio.Handle | None = None
+        self._unsent_since: float | None = None
+        self._partial_since: float | None = None
+        self.peer = ""
+        self.seen = 0.0  # monotonic time of the last request
+
+    # What asyncio calls
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Let the client in, or end the connection before a byte is read."""
+        self._transport = cast("asyncio.Transport", transport)
+        self.seen = self._now()
+        peername = transport.get_extra_info("peername")
+        self.peer = str(peername[0]) if peername else ""
+        if not self._admit(self, self.peer):
+            self._over = True
+            self._transport.abort()
+            return
+        keep_alive(transport)
+        self._transport.set_write_buffer_limits(high=MAX_UNSENT)
+        self._write = self._transport.write
+        self._direct = True
+
+    def data_received(self, data: bytes) -> None:
+        """Answer what can be answered now, in order."""
+        try:
+            if self._direct:
+                if len(data) == READ_SIZE:
+                    entry = self._find(data[2:])
+                    if entry is not None:
+                        now = self._now()
+                        if now < entry[0] and entry[1].snapshot is entry[2]:
+                            self.seen = now
+                            stats = self._stats
+                            stats.requests += 1
+                            stats.cache_hits += 1
+                            self._write(data[:2] + entry[3])
+                            return
+                else:
+                    data = self._answer_hot(data)
+            if data and not self._ending:
+                self._input += data
+                self._work()
+        except Exception:
+            logger.exception("connection_failed peer=%s", self.peer)
+            self._broken()
+
+    def eof_received(self) -> bool:
+        """The client sends no more; what it asked is still answered."""
+        self._ending = True
+        self._direct = False
+        self._guarded(self._work)
+        return not self._over
+
+    def pause_writing(self) -> None:
+        """The client does not take its replies."""
+        self._unsent_since = self._now()
+        self._direct = False
+        self._set_reading(on=False)
+
+    def resume_writing(self) -> None:
+        """The client took its replies."""
+        self._unsent_since = None
+        self._guarded(self._work)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Withdraw what this client asked of the lines; how it went (`exc`) makes no difference."""
+        del exc
+        self._over = True
+        self._direct = False
+        if self._resume is not None:
+            self._resume.cancel()
+        for due in self._due:
+            if due.ticket is not None:
+                due.ticket.cancel()
+        self._due.clear()
+        self._adus.clear()
+        self._input = b""
+        self._left(self)
+
+    # What the server calls
+
+    @property
+    def idle(self) -> bool:
+        """Whether the client waits for nothing."""
+        return not self._due and self._unsent_since is None
+
+    def overdue(self, now: float) -> str | None:
+        """Why this connection should end at `now`; None: it is fine."""
+        settings = self._settings
+        if self._closing_since is not None:
+            return "not_reading" if now - self._closing_since > settings.write_timeout_s else None
+        if self._due and now - self._due[0].since > settings.reply_timeout_s:
+            return "unanswered"
+        if self._unsent_since is not None and now - self._unsent_since > settings.write_timeout_s:
+            return "not_reading"
+        if self._partial_since is not None and now - self._partial_since > settings.frame_timeout_s:
+            return "slow_frame"
+        if self.idle and now - self.seen > settings.idle_timeout_s:
+            return "idle"
+        return None
+
+    def end(self, reason: str) -> None:
+        """End the connection now, whatever is under way; counted under `reason`."""
+        if self._transport is None:
+            return
+        self._stats.closed[reason] += 1
+        self._direct = False
+        if self.idle and not self._over:
+            self._closing_since = self._now()
+            self._transport.close()
+        else:
+            self._transport.abort()
+        self._over = True
+
+    def finish(self) -> None:
+        """Take no further request, and close when those taken are answered."""
+        self._input = b""
+        self._adus.clear()
+        self._ending = True
+        self._direct = False
+        self._settle()
+
+    # The way in
+
+    def _answer_hot(self, data: bytes) -> bytes:
+        """Answer requests from the front of a segment as long as each is known; returns the rest."""
+        find = self._find
+        now = self._now()
+        size = len(data)
+        at = 0
+        while self._direct:
+            out: list[bytes] = []
+            hits = 0
+            while hits < MAX_BURST and at + READ_SIZE <= size:
+                entry = find(data[at + 2 : at + READ_SIZE])
+                if entry is None or now >= entry[0] or entry[1].snapshot is not entry[2]:
+                    break
+                out.append(data[at : at + 2])
+                out.append(entry[3])
+                hits += 1
+                at += READ_SIZE
+            if not hits:
+                break
+            self.seen = now
+            self._stats.requests += hits
+            self._stats.cache_hits += hits
+            self._write(b"".join(out))  # may call pause_writing, which ends the loop
+        return data[at:] if at else data
+
+    def _work(self) -> None:
+        """Look at what was received as far as rules 1 and 2 allow."""
+        if self._over or self._resume is not None:
+            return
+        now = self._now()
+        out: list[bytes] = []
+        looked_at = 0
+        while len(self._due) < MAX_WAITING and self._unsent_since is None and (self._adus or self._cut(now)):
+            if looked_at == TURN:
+                self._resume = asyncio.get_running_loop().call_soon(self._work_on)
+                break
+            looked_at += 1
+            self.seen = now
+            self._take(self._adus.popleft(), now, out)
+            if len(out) >= MAX_BURST:
+                self._write(b"".join(out))
+                out.clear()
+        if out:
+            self._write(b"".join(out))
+        self._settle()
+
+    def _work_on(self) -> None:
+        """Go on after the others had their turn."""
+        self._resume = None
+        self._guarded(self._work)
+
+    def _cut(self, now: float) -> bool:
+        """Cut the next piece of the input; whether there is a request now."""
+        splitter = self._splitter
+        while self._input:
+            piece, self._input = self._input[:PIECE], self._input[PIECE:]
+            self._adus.extend(splitter.feed(piece))
+            foreign = splitter.foreign - self._foreign
+            if foreign:
+                self._foreign = splitter.foreign
+                self._stats.malformed["protocol_id"] += foreign
+                self._suspect = True
+            elif self._adus:
+                self._suspect = False
+            if not splitter.pending:
+                self._partial_since = None
+            elif self._adus or self._partial_since is None:
+                self._partial_since = now
+            if splitter.lost is not None:
+                self._stats.malformed[f"framing_{splitter.lost}"] += 1
+                self._stats.closed["framing_lost"] += 1
+                self._input = b""
+                self._ending = True
+            if self._adus:
+                return True
+        return False
+
+    def _take(self, adu: Adu, now: float, out: list[bytes]) -> None:
+        """Answer one request, or ask for its answer; what may leave now is put into `out`."""
+        tid = adu.tid.to_bytes(2)
+        answer = self._dispatcher.answer(adu.unit, adu.pdu, self.peer, now)
+        if isinstance(answer, bytes) and not self._due:
+            out.append(tid)
+            out.append(answer)
+            return
+        due = _Due(tid, now)
+        self._due.append(due)
+        if isinstance(answer, bytes):
+            due.reply = answer
+            return
+        due.forward = answer
+        device = answer.device
+        due.ticket = device.line.read(device, answer.ask.pdu, lambda outcome: self._done(due, outcome))
+
+    # The way out
+
+    def _done(self, due: _Due, outcome: Outcome) -> None:
+        """The line has answered a request of this connection."""
+        self._guarded(lambda: self._conclude(due, outcome))
+
+    def _conclude(self, due: _Due, outcome: Outcome) -> None:
+        if self._over:
+            return
+        assert due.forward is not None
+        due.ticket = None
+        due.reply = self._dispatcher.conclude(due.forward, outcome)
+        if due is not self._due[0]:
+            return
+        out: list[bytes] = []
+        while self._due and (reply := self._due[0].reply) is not None:
+            out.append(self._due.popleft().tid)
+            out.append(reply)
+        self._write(b"".join(out))
+        self._work()
+
+    def _settle(self) -> None:
+        """After any change: read on or pause, close when all is said."""
+        if self._over:
+            return
+        assert self._transport is not None
+        waiting = bool(self._adus or self._input)
+        if self._ending:
+            self._set_reading(on=False)
+            if not self._due and not waiting:
+                self._over = True
+                self._closing_since = self._now()
+                self._transport.close()
+            return
+        self._set_reading(on=not waiting and self._unsent_since is None)
+        self._direct = not (
+            self._due or waiting or self._unsent_since is not None or self._splitter.pending or self._suspect
+        )
+
+    def _set_reading(self, *, on: bool) -> None:
+        if self._transport is None or on is self._reading or self._transport.is_closing():
+            return
+        self._reading = on
+        if on:
+            self._transport.resume_reading()
+        else:
+            self._transport.pause_reading()
+
+    def _guarded(self, step: Callable[[], None]) -> None:
+        """Rule 4."""
+        try:
+            step()
+        except Exception:
+            logger.exception("connection_failed peer=%s", self.peer)
+            self._broken()
+
+    def _broken(self) -> None:
+        self._stats.closed["error"] += 1
+        self._over = True
+        self._direct = False
+        if self._transport is not None:
+            self._transport.abort()
+
+
+def _nowhere(data: bytes) -> None:
+    """Stand for the transport before there is one."""
+    del data

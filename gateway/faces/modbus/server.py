@@ -1,0 +1,176 @@
+"""The Modbus TCP face: its listeners, and which connections there are.
+
+Rule 1: a client that is not in `allow` is cut off before a byte of it is read.
+Rule 2: there are at most `max_connections`. Over that the connection that has been idle longest makes room when
+        it asked nothing for `evict_idle_s`; when all are at work the newcomer is refused.
+Rule 3: once a second every connection is asked whether it should end (idle, half a request, a client that
+        takes no replies, a request nobody answers); the hot path sets no timers.
+Rule 4: a listener that stops takes no more connections, lets the requests under way be answered for
+        `stop_grace_s`, then cuts off.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Sequence
+from functools import partial
+
+from gateway.clock import Clock
+from gateway.core.log_budget import LogBudget
+from gateway.core.site import Site
+from gateway.core.stats import ModbusServerStats
+from gateway.errors import ListenError
+from gateway.faces.modbus.connection import Connection
+from gateway.faces.modbus.dispatch import Dispatcher
+from gateway.faces.modbus.settings import ModbusSettings
+from gateway.faces.modbus.tcp import allowed, bind_problem
+
+logger = logging.getLogger(__name__)
+
+SWEEP_S = 1.0
+BACKLOG = 128
+
+
+class Listener:
+    """One listening address and the connections that came through it."""
+
+    def __init__(self, server: ModbusServer, host: str, port: int) -> None:
+        self._server = server
+        self._host = host
+        self._port = port
+        self._listening: asyncio.Server | None = None
+        self._connections: set[Connection] = set()
+        self._empty = asyncio.Event()
+        shown = f"[{host}]" if ":" in host else host
+        self.label = f"modbus {shown}:{port}"
+
+    @property
+    def bound(self) -> tuple[str, int] | None:
+        """The address that is really listened on; None while stopped."""
+        if self._listening is None or not self._listening.sockets:
+            return None
+        host, port = self._listening.sockets[0].getsockname()[:2]
+        return host, port
+
+    async def start(self) -> None:
+        """Listen; raises ListenError that names the address and why. May be tried again."""
+        if self._listening is not None:
+            return
+        loop = asyncio.get_running_loop()
+        try:
+            self._listening = await loop.create_server(self._connection, self._host, self._port, backlog=BACKLOG)
+        except OSError as error:
+            raise ListenError(f"{self.label}: {bind_problem(error)}") from error
+        self._server.started(self)
+        logger.info("listening face=modbus address=%s port=%d", *(self.bound or (self._host, self._port)))
+
+    async def stop(self) -> None:
+        """Take no more connections, let the open ones finish (rule 4)."""
+        listening, self._listening = self._listening, None
+        if listening is None:
+            return
+        listening.close()
+        for connection in tuple(self._connections):
+            connection.finish()
+        try:
+            async with asyncio.timeout(self._server.settings.stop_grace_s):
+                while self._connections:
+                    self._empty.clear()
+                    await self._empty.wait()
+        except TimeoutError:
+            for connection in tuple(self._connections):
+                connection.end("stopped")
+        finally:
+            self._server.stopped(self)
+        await listening.wait_closed()
+
+    def _connection(self) -> Connection:
+        server = self._server
+        return Connection(server.dispatcher, server.settings, partial(server.admit, self), self.left)
+
+    def joined(self, connection: Connection) -> None:
+        """A connection was let in."""
+        self._connections.add(connection)
+
+    def left(self, connection: Connection) -> None:
+        """A connection is over."""
+        self._connections.discard(connection)
+        self._server.left(connection)
+        if not self._connections:
+            self._empty.set()
+
+
+class ModbusServer:
+    """The face: `listeners` are started and stopped by the service."""
+
+    def __init__(self, settings: ModbusSettings, site: Site, clock: Clock, stats: ModbusServerStats) -> None:
+        self.settings = settings
+        self.dispatcher = Dispatcher(settings, site, clock, stats)
+        self.listeners: Sequence[Listener] = tuple(Listener(self, host, port) for host, port in settings.listen)
+        self._stats = stats
+        self._now = clock.monotonic
+        self._connections: set[Connection] = set()
+        self._listening: set[Listener] = set()
+        self._sweep: asyncio.TimerHandle | None = None
+        self._refusals_told = LogBudget()
+
+    def admit(self, listener: Listener, connection: Connection, peer: str) -> bool:
+        """Whether a new connection may stay (rules 1 and 2)."""
+        self._stats.connections += 1
+        if not allowed(peer, self.settings.allow):
+            return self._refuse("not_allowed", peer)
+        if len(self._connections) >= self.settings.max_connections and not self._make_room():
+            return self._refuse("full", peer)
+        self._connections.add(connection)
+        self._stats.open_connections = len(self._connections)
+        listener.joined(connection)
+        return True
+
+    def left(self, connection: Connection) -> None:
+        """A connection is over."""
+        self._connections.discard(connection)
+        self._stats.open_connections = len(self._connections)
+
+    def started(self, listener: Listener) -> None:
+        """A listener listens."""
+        self._listening.add(listener)
+        if self._sweep is None:
+            self._sweep = asyncio.get_running_loop().call_later(SWEEP_S, self._sweep_again)
+
+    def stopped(self, listener: Listener) -> None:
+        """A listener is closed."""
+        self._listening.discard(listener)
+        if not self._listening and self._sweep is not None:
+            self._sweep.cancel()
+            self._sweep = None
+
+    def sweep(self) -> None:
+        """End the connections whose time is up (rule 3)."""
+        now = self._now()
+        for connection in tuple(self._connections):
+            reason = connection.overdue(now)
+            if reason is not None:
+                logger.info("connection_ended peer=%s reason=%s", connection.peer, reason)
+                connection.end(reason)
+
+    def _sweep_again(self) -> None:
+        self._sweep = asyncio.get_running_loop().call_later(SWEEP_S, self._sweep_again)
+        self.sweep()
+
+    def _make_room(self) -> bool:
+        idle = [connection for connection in self._connections if connection.idle]
+        oldest = min(idle, key=lambda connection: connection.seen, default=None)
+        if oldest is None or self._now() - oldest.seen < self.settings.evict_idle_s:
+            return False
+        oldest.end("evicted")
+        self.left(oldest)
+        return True
+
+    def _refuse(self, reason: str, peer: str) -> bool:
+        self._stats.refused_connections += 1
+        self._stats.closed[reason] += 1
+        left_out = self._refusals_told.spend((reason, peer), self._now())
+        if left_out is not None:
+            logger.warning("connection_refused peer=%s reason=%s left_out=%d", peer, reason, left_out)
+        return False

@@ -1,0 +1,57 @@
+"""What is about TCP and addresses and knows nothing of Modbus."""
+
+from __future__ import annotations
+
+import errno
+import socket
+from asyncio import BaseTransport
+from collections.abc import Sequence
+from ipaddress import IPv6Address, ip_address
+
+from gateway.faces.modbus.settings import Network
+
+KEEPALIVE_IDLE_S = 30
+KEEPALIVE_INTERVAL_S = 10
+KEEPALIVE_PROBES = 3
+USER_TIMEOUT_MS = 20_000
+
+_REASONS = {
+    errno.EADDRINUSE: "another program listens there",
+    errno.EACCES: "not permitted: a port below 1024 needs CAP_NET_BIND_SERVICE",
+    errno.EADDRNOTAVAIL: "this machine has no such address",
+    errno.EAFNOSUPPORT: "this machine does not speak that address family",
+}
+
+
+def allowed(peer: str, networks: Sequence[Network]) -> bool:
+    """Whether an address lies in one of the networks; an IPv4 address mapped into IPv6 counts as the IPv4 one."""
+    try:
+        address = ip_address(peer.partition("%")[0])
+    except ValueError:
+        return False
+    if isinstance(address, IPv6Address) and address.ipv4_mapped is not None:
+        address = address.ipv4_mapped
+    return any(address in network for network in networks)
+
+
+def keep_alive(transport: BaseTransport) -> None:
+    """Have the kernel end the connection of a peer that is gone: after 60 s idle, after 20 s of unacknowledged data."""
+    sock = transport.get_extra_info("socket")
+    if sock is None:
+        return
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for option, value in (
+        ("TCP_KEEPIDLE", KEEPALIVE_IDLE_S),
+        ("TCP_KEEPINTVL", KEEPALIVE_INTERVAL_S),
+        ("TCP_KEEPCNT", KEEPALIVE_PROBES),
+        ("TCP_USER_TIMEOUT", USER_TIMEOUT_MS),
+    ):
+        if hasattr(socket, option):  # not every system has them
+            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+
+
+def bind_problem(error: OSError) -> str:
+    """Why an address cannot be listened on, in words."""
+    if isinstance(error, socket.gaierror):
+        return "the name does not resolve to an address"
+    return _REASONS.get(error.errno or 0, error.strerror or str(error))
