@@ -121,6 +121,19 @@ class Point:
     mib: MibColumn | None
     metric: str | None  # full metric name, None where none is made
     metric_scale: float  # metric sample = value × metric_scale (kWh → Wh, min → s)
+    plausible: tuple[float, float] | None = None  # a value outside is withheld and counted, never shown
+    multiplied_by: str | None = None  # point that multiplies this one before the device uses it
+    note: str = ""  # where document and field, or two places of the document, disagree
+
+    @property
+    def polled(self) -> bool:
+        """Whether the poll plan reads it and the decoder shows it."""
+        return self.group is not Group.COMMAND
+
+    @property
+    def metric_type(self) -> str:
+        """Prometheus type: "counter" for totals that only grow until somebody clears them, else "gauge"."""
+        return "counter" if self.metric is not None and self.metric.endswith("_total") else "gauge"
 
     def reading(self, name: str | None = None) -> Reading:
         """The reading called `name`, or the document's; KeyError when there is none of that name."""

@@ -1,0 +1,106 @@
+"""The daily log: a ring of equal blocks, one a day, put in order by their hourmeter.
+
+Rule 1: a block whose hourmeter is zero or all ones (24 or 32 bits) was never written and is left out.
+Rule 2: the document says high word first, units in the field were seen with the low word first. The right order
+        is the one in which the hourmeters grow along the ring and none is ahead of the live hourmeter; while
+        both would do, the document's holds. All 32-bit fields of a log share one order.
+Rule 3: the ring is cut where its hourmeter steps back, so one step back is natural and a second one is not.
+Rule 4: values come in base units: minutes become seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from struct import Struct
+from types import MappingProxyType
+
+from gateway.devices.codecs import combine, decode
+from gateway.devices.model import LogLayout, Value, WordOrder
+
+HOURMETER = "hourmeter"
+"""Name of the field that every log layout must have."""
+
+_NEVER_WRITTEN = frozenset({0, 0x00FF_FFFF, 0xFFFF_FFFF})
+
+
+@dataclass(frozen=True, slots=True)
+class LogDay:
+    """One day of the log. `values` are in the units of the layout's fields; a field without value is absent."""
+
+    slot: int  # position in the ring
+    hourmeter: int  # hours, when the day was written
+    values: Mapping[str, Value]
+
+
+@dataclass(frozen=True, slots=True)
+class DailyLog:
+    """The days found, oldest first, with the word order they were read in."""
+
+    days: tuple[LogDay, ...]
+    order: WordOrder
+    certain: bool  # False while the other order would fit as well, or neither does
+    empty: int  # blocks that were never written
+
+
+def split_blocks(layout: LogLayout, data: bytes, first_slot: int = 0) -> dict[int, bytes]:
+    """Cut the bytes of a read that began at `first_slot` into blocks; ValueError when they are not whole blocks."""
+    size = 2 * layout.block_words
+    if len(data) % size:
+        raise ValueError(f"{len(data)} bytes are not whole blocks of {size}")
+    return {first_slot + n: data[n * size : (n + 1) * size] for n in range(len(data) // size)}
+
+
+def decode_log(layout: LogLayout, blocks: Mapping[int, bytes], live_hourmeter: int | None = None) -> DailyLog:
+    """Decode log blocks by slot (each `block_words` big-endian words), all or some of the ring.
+
+    `live_hourmeter` in hours makes the word order more certain. ValueError when a block has another size.
+    """
+    words = Struct(f">{layout.block_words}H")
+    raw: dict[int, tuple[int, ...]] = {}
+    for slot in sorted(blocks):
+        if len(blocks[slot]) != words.size:
+            raise ValueError(f"log block {slot} has {len(blocks[slot])} bytes, not {words.size}")
+        raw[slot] = words.unpack(blocks[slot])
+    meter = next(field for field in layout.fields if field.name == HOURMETER)
+    pairs = {slot: block[meter.offset : meter.offset + meter.words] for slot, block in raw.items()}
+    written = {slot: pair for slot, pair in pairs.items() if not _never_written(pair)}
+    order, certain = detect_order(tuple(written.values()), live_hourmeter)
+    days = [
+        LogDay(slot, combine(pair, order), MappingProxyType(_values(layout, raw[slot], order)))
+        for slot, pair in written.items()
+    ]
+    days.sort(key=lambda day: (day.hourmeter, day.slot))
+    return DailyLog(tuple(days), order, certain, len(raw) - len(written))
+
+
+def detect_order(pairs: Sequence[Sequence[int]], live_hourmeter: int | None = None) -> tuple[WordOrder, bool]:
+    """The word order of hourmeter words given in ring order, and whether it is the only one that fits."""
+    scores = {order: _misfits([combine(pair, order) for pair in pairs], live_hourmeter) for order in WordOrder}
+    documented, other = scores[WordOrder.HI_LO], scores[WordOrder.LO_HI]
+    order = WordOrder.LO_HI if other < documented else WordOrder.HI_LO
+    return order, min(scores.values()) == 0 < max(scores.values())
+
+
+def _misfits(hours: Sequence[int], live_hourmeter: int | None) -> int:
+    ahead = 0 if live_hourmeter is None else sum(hour > live_hourmeter for hour in hours)
+    steps_back = sum(later < earlier for earlier, later in pairwise(hours))
+    if len(hours) > 1 and steps_back == 1:
+        steps_back += hours[-1] > hours[0]  # a ring cut once: its end is older than its beginning
+    else:
+        steps_back = max(0, steps_back - 1)
+    return ahead + steps_back
+
+
+def _never_written(pair: Sequence[int]) -> bool:
+    return any(combine(pair, order) in _NEVER_WRITTEN for order in WordOrder)
+
+
+def _values(layout: LogLayout, block: Sequence[int], order: WordOrder) -> dict[str, Value]:
+    values: dict[str, Value] = {}
+    for field in layout.fields:
+        value = decode(field.codec, block[field.offset : field.offset + field.words], order, field.scale)
+        if value is not None:
+            values[field.name] = value
+    return values
