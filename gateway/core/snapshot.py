@@ -52,8 +52,8 @@ class Snapshot:
     state_since: float = 0.0
     last_reply_at: float | None = None
     blocks: tuple[Block, ...] = ()
-    values: Mapping[str, Value] = field(default=_NO_VALUES)
-    read_at: Mapping[str, float] = field(default=_NO_TIMES)  # point name → its block's read_at
+    values: Mapping[str, Value] = field(default_factory=lambda: _NO_VALUES)
+    read_at: Mapping[str, float] = field(default_factory=lambda: _NO_TIMES)  # point name → its block's read_at
     identification: Identification | None = None
     serial_number: str | None = None
 
