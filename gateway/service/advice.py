@@ -1,0 +1,99 @@
+"""What is allowed in a configuration and yet worth a second look; `check-config` and the log show it.
+
+Advice never keeps the gateway from starting. Each begins with the key path, as problems do.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from gateway.core.budget import LineBudget
+from gateway.service.schema import DOCUMENTATION_ROOT, Config, LineTable, parse_listen, parse_root
+
+SATURATED = 0.95
+GUESSED_COMMUNITIES = ("public", "private")
+
+
+def advice(config: Config, budgets: Sequence[LineBudget]) -> tuple[str, ...]:
+    """What an experienced colleague would say about the file; `budgets` in the order of the lines."""
+    return (*_lines(config, budgets), *_modbus(config), *_snmp(config), *_http(config))
+
+
+def _lines(config: Config, budgets: Sequence[LineBudget]) -> Iterator[str]:
+    seen: dict[str, str] = {}
+    for index, (line, budget) in enumerate(zip(config.line, budgets, strict=True)):
+        path = f"line[{index}]"
+        yield from _port(f"{path}.port", line, seen)
+        if budget.use_ratio > SATURATED:
+            yield (
+                f"{path}: polling would take {budget.use_ratio:.0%} of the line, so live values come every "
+                f"{budget.live_refresh_s:.1f} s; ask for them less often (poll.live_s) or use a second line"
+            )
+        if budget.live_refresh_s >= config.cache.max_age_s:
+            yield (
+                f"{path}: live values come every {budget.live_refresh_s:.1f} s, which is not within cache.max_age_s "
+                f"({config.cache.max_age_s} s): Modbus reads will have to wait for the line"
+            )
+
+
+def _port(path: str, line: LineTable, seen: dict[str, str]) -> Iterator[str]:
+    port = line.port
+    if "://" in port:
+        return
+    if port.startswith(("/dev/ttyUSB", "/dev/ttyACM")):
+        text = f"{port} may be another adapter after the next start"
+        yield f"{path}: {text}; use its name in /dev/serial/by-id or /dev/serial/by-path"
+    real = str(Path(port).resolve())
+    if real in seen:
+        yield f"{path}: {port} is at present the same port as {seen[real]}; only one line can have it"
+    seen.setdefault(real, path)
+
+
+def _modbus(config: Config) -> Iterator[str]:
+    exposed = _beyond_loopback(config.modbus.listen)
+    for path, text in _named("modbus.listen", exposed):
+        what = "can be reached from other machines, and Modbus TCP has no password"
+        yield f"{path}: {text} {what}; keep modbus.allow narrow"
+    for index, network in enumerate(config.modbus.allow):
+        if ipaddress.ip_network(network).prefixlen == 0:
+            yield f"modbus.allow[{index}]: {network} is everybody"
+    if exposed and all(ipaddress.ip_network(network).is_loopback for network in config.modbus.allow):
+        yield "modbus.allow: only this machine may connect, so listening on other addresses is of no use"
+    if config.modbus.listen and not config.modbus.allow:
+        yield "modbus.allow: is empty, so nobody may connect"
+
+
+def _snmp(config: Config) -> Iterator[str]:
+    snmp = config.snmp
+    if not snmp.listen:
+        return
+    if not snmp.community:
+        yield "snmp.community: there is none, so nobody can read by SNMP and the port is not opened"
+        return
+    if parse_root(snmp.enterprise_root)[: len(DOCUMENTATION_ROOT)] == DOCUMENTATION_ROOT:
+        yield "snmp.enterprise_root: 32473 is the number for documentation; use your own enterprise number in service"
+    for path, text in _named("snmp.listen", _beyond_loopback(snmp.listen)):
+        yield f"{path}: {text} can be reached from other machines, and SNMP v2c sends the community in clear"
+    for index, community in enumerate(snmp.community):
+        networks = [ipaddress.ip_network(source) for source in community.source]
+        if community.name in GUESSED_COMMUNITIES and not all(network.is_loopback for network in networks):
+            yield f"snmp.community[{index}].name: is one that everybody tries first"
+        for number, network in enumerate(networks):
+            if network.prefixlen == 0:
+                yield f"snmp.community[{index}].source[{number}]: {network} is everybody"
+
+
+def _http(config: Config) -> Iterator[str]:
+    for path, text in _named("http.listen", _beyond_loopback(config.http.listen)):
+        yield f"{path}: {text} can be reached from other machines, and /metrics has no password"
+
+
+def _beyond_loopback(listens: Sequence[str]) -> list[tuple[int, str]]:
+    return [(index, text) for index, text in enumerate(listens) if not parse_listen(text).loopback]
+
+
+def _named(key: str, found: Sequence[tuple[int, str]]) -> Iterator[tuple[str, str]]:
+    for index, text in found:
+        yield f"{key}[{index}]", text

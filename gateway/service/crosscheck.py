@@ -1,0 +1,131 @@
+"""Checks that compare one key with another, or with a device map.
+
+They read the raw file and skip whatever has the wrong type or is missing: the schema reports that. So one run
+names every problem, whichever kind it is. What is compared is only what is unmistakable: two ports that are the
+same by a symbolic link are a matter for the lock on the port, which the running gateway reports.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Iterator, Mapping
+
+from gateway.devices.schema import load_map, models
+from gateway.service.problems import Path, Problem, render_path, show, table_at
+from gateway.service.schema import NOT_SUPPORTED, Address, parse_listen
+
+Raw = Mapping[str, object]
+
+
+def cross_problems(raw: Raw) -> list[Problem]:
+    """Every problem of the file that takes more than one key to see."""
+    lines = list(_tables(raw, "line", ()))
+    devices = [found for path, line in lines for found in _tables(line, "device", path)]
+    problems = [
+        *_repeated(((*path, "name"), line.get("name")) for path, line in lines),
+        *_repeated(((*path, "port"), line.get("port")) for path, line in lines),
+        *_repeated(((*path, "name"), device.get("name")) for path, device in devices),
+        *_repeated(((*path, "unit_id"), device.get("unit_id")) for path, device in devices),
+    ]
+    for path, line in lines:
+        problems += _repeated(((*at, "address"), device.get("address")) for at, device in _tables(line, "device", path))
+        problems += _upstream((*path, "port"), line.get("port"))
+    for path, device in devices:
+        problems += _model(path, device)
+    snmp = _table(raw, "snmp")
+    communities = _tables(snmp, "community", ("snmp",))
+    problems += _repeated((((*path, "name"), table.get("name")) for path, table in communities), secret=True)
+    problems += _listen_clashes(raw, ("modbus", "http"))
+    problems += _listen_clashes(raw, ("snmp",))
+    if _table(raw, "modbus").get("writes") is True:
+        problems.append(Problem(("modbus", "writes"), f"writing to controllers is {NOT_SUPPORTED}; allowed: false"))
+    return problems
+
+
+def _table(raw: Raw, name: str) -> Raw:
+    table = raw.get(name)
+    return table if isinstance(table, Mapping) else {}
+
+
+def _tables(raw: Raw, name: str, path: Path) -> Iterator[tuple[Path, Raw]]:
+    """The tables of a list of tables, each with its key path."""
+    tables = raw.get(name)
+    if isinstance(tables, list):
+        for index, table in enumerate(tables):
+            if isinstance(table, Mapping):
+                yield (*path, name, index), table
+
+
+def _repeated(values: Iterator[tuple[Path, object]], *, secret: bool = False) -> Iterator[Problem]:
+    seen: dict[object, Path] = {}
+    for path, value in values:
+        if not isinstance(value, str | int) or isinstance(value, bool):
+            continue
+        if value in seen:
+            shown = "the same value" if secret else show(value)
+            yield Problem(path, f"{shown} is already used by {render_path(seen[value])}; allowed: a value of its own")
+        else:
+            seen[value] = path
+
+
+def _upstream(path: Path, port: object) -> Iterator[Problem]:
+    if isinstance(port, str) and port.startswith("tcp://"):
+        text = f"Modbus TCP upstreams are {NOT_SUPPORTED}; allowed: a device path, rfc2217://host:port or socket://host:port"
+        yield Problem(path, text)
+
+
+def _model(path: Path, device: Raw) -> Iterator[Problem]:
+    model = device.get("model")
+    if not isinstance(model, str):
+        return
+    if model not in models():
+        known = ", ".join(f'"{name}"' for name in models())
+        what = f"finding the model by itself is {NOT_SUPPORTED}" if model == "auto" else f"{show(model)} has no map"
+        yield Problem((*path, "model"), f"{what}; allowed: {known}")
+        return
+    decode = device.get("decode")
+    if not isinstance(decode, Mapping):
+        return
+    points = {point.name: point for point in load_map(model).points if len(point.readings) > 1}
+    for name, reading in decode.items():
+        if name not in points:
+            text = f"no point of {model} with another reading has this name; allowed: {', '.join(points) or 'none'}"
+            yield Problem((*path, "decode", name), text)
+        elif isinstance(reading, str) and reading not in (names := [known.name for known in points[name].readings]):
+            allowed = ", ".join(f'"{known}"' for known in names)
+            yield Problem((*path, "decode", name), f"{show(reading)} is no reading of this point; allowed: {allowed}")
+
+
+def _listen_clashes(raw: Raw, faces: tuple[str, ...]) -> Iterator[Problem]:
+    """Addresses of one transport that cannot be opened together: the same, or one that covers the other."""
+    seen: list[tuple[Address, Path]] = []
+    for face in faces:
+        table = table_at((face,))
+        assert table is not None
+        listens = _table(raw, face).get("listen", list(table.model_fields["listen"].default))
+        for index, text in enumerate(listens if isinstance(listens, list) else []):
+            address = _address(text)
+            if address is None or address.port == 0:
+                continue
+            path: Path = (face, "listen", index)
+            other = next((at for known, at in seen if _covers(known, address)), None)
+            if other is None:
+                seen.append((address, path))
+            else:
+                yield Problem(path, f"{show(text)} clashes with {render_path(other)}; allowed: another address or port")
+
+
+def _address(text: object) -> Address | None:
+    try:
+        return parse_listen(text) if isinstance(text, str) else None
+    except ValueError:
+        return None
+
+
+def _covers(one: Address, other: Address) -> bool:
+    if one.port != other.port:
+        return False
+    first, second = ipaddress.ip_address(one.host), ipaddress.ip_address(other.host)
+    if first.version != second.version:
+        return False
+    return first == second or first.is_unspecified or second.is_unspecified

@@ -1,0 +1,285 @@
+"""The configuration file as classes: every key, its type, range, default and what it is for.
+
+Rule 1: a key exists only here. Problem texts, config/full.toml, docs/configuration.md and the suggestions for
+misspelt keys are checked against (or made from) these classes.
+Rule 2: a class checks one value at a time. Whatever compares two keys lives in service/crosscheck.py, which
+works on the raw file, so that both kinds of problem are reported together.
+Rule 3: a key that this version cannot honour is not here; `UNSUPPORTED` says so by name.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from dataclasses import dataclass
+from typing import Annotated, Literal
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from gateway.core.settings import LineSettings, PollSettings
+
+MORNINGSTAR_ROOT = (1, 3, 6, 1, 4, 1, 33333)
+DOCUMENTATION_ROOT = (1, 3, 6, 1, 4, 1, 32473)
+PORT_SCHEMES = ("rfc2217", "socket")
+NOT_SUPPORTED = "not supported in this version"
+
+UNSUPPORTED = {
+    ("snmp", "user"): f"SNMPv3 users are {NOT_SUPPORTED}; allowed: [[snmp.community]]",
+    ("snmp", "notify"): f"traps and informs are {NOT_SUPPORTED}; allowed: leave the table out",
+}
+"""Keys of later versions, by their path without list positions, with what to tell the reader."""
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """What a reader is told about a key: what is allowed, and what the key does."""
+
+    allowed: str
+    does: str
+    secret: bool = False  # its value never appears in a problem text
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """An IP address and a port to listen on; port 0 takes any free one."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+    @property
+    def loopback(self) -> bool:
+        """Whether only this machine can reach it."""
+        return ipaddress.ip_address(self.host).is_loopback
+
+
+def parse_listen(text: str) -> Address:
+    """The address of `127.0.0.1:1502` or `[::1]:1502`; ValueError for anything else, names included."""
+    host, colon, port = text.rpartition(":")
+    if host.startswith("[") and host.endswith("]"):
+        ip: ipaddress.IPv4Address | ipaddress.IPv6Address = ipaddress.IPv6Address(host[1:-1])
+    else:
+        ip = ipaddress.IPv4Address(host)
+    if not colon or not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:
+        raise ValueError("no port")
+    return Address(str(ip), int(port))
+
+
+def parse_root(text: str) -> tuple[int, ...]:
+    """The numbers of a dotted OID below 1.3.6.1.4.1; ValueError otherwise."""
+    if not re.fullmatch(r"1\.3\.6\.1\.4\.1(\.(0|[1-9][0-9]{0,9})){1,20}", text):
+        raise ValueError("not an OID below 1.3.6.1.4.1")
+    root = tuple(int(part) for part in text.split("."))
+    if max(root) > 0xFFFF_FFFF:
+        raise ValueError("a number is above 4294967295")
+    if root[:7] == MORNINGSTAR_ROOT:
+        raise ValueError("33333 belongs to Morningstar")
+    return root
+
+
+def _listen(text: str) -> str:
+    return str(parse_listen(text))
+
+
+def _network(text: str) -> str:
+    return str(ipaddress.ip_network(text))
+
+
+def _root(text: str) -> str:
+    parse_root(text)
+    return text
+
+
+def _port(text: str) -> str:
+    if "://" not in text:
+        if not text.startswith("/"):
+            raise ValueError("no absolute path")
+        return text
+    parts = urlsplit(text)
+    if parts.scheme == "tcp":  # crosscheck says that this is for a later version
+        return text
+    if parts.scheme not in PORT_SCHEMES or not parts.hostname or parts.port is None or parts.path not in ("", "/"):
+        raise ValueError("not a known URL")
+    return text
+
+
+Name = Annotated[str, Field(pattern=r"^[^\s\x00-\x1f\x7f]([^\x00-\x1f\x7f]{0,62}[^\s\x00-\x1f\x7f])?$")]
+Text = Annotated[str, Field(pattern=r"^[ -~]{0,255}$")]
+Listen = Annotated[str, AfterValidator(_listen)]
+Network = Annotated[str, AfterValidator(_network)]
+Seconds = Annotated[float, Field(allow_inf_nan=False)]
+Listens = Annotated[tuple[Listen, ...], Field(strict=False)]
+Networks = Annotated[tuple[Network, ...], Field(strict=False)]
+
+_NAME = "1 to 64 printable characters, no blank at either end"
+_TEXT = "up to 255 printable ASCII characters"
+_LISTEN = 'a list of "IPv4:port" or "[IPv6]:port" such as "127.0.0.1:1502"; [] turns the face off'
+_NETWORK = 'a list of addresses or networks such as "127.0.0.0/8", "10.1.2.3" or "::1/128"'
+_LOOPBACK = ("127.0.0.0/8", "::1/128")
+_LINE = LineSettings(name="", index=1, port="")
+_POLL = PollSettings()
+
+
+class Table(BaseModel):
+    """A table of the file: unknown keys are refused, nothing is converted, nothing can be changed."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
+
+
+class DeviceTable(Table):
+    """`[[line.device]]`: a controller on the line."""
+
+    name: Annotated[Name, Key(_NAME, "What the controller is called on every face; unique in the gateway.")]
+    address: Annotated[int, Key("1 to 247", "Its Modbus address on the line; factory setting 1.")] = Field(ge=1, le=247)
+    unit_id: Annotated[
+        int,
+        Key("1 to 247", "What Modbus TCP clients ask for, and the SNMP index; unique in the gateway."),
+    ] = Field(ge=1, le=247)
+    model: Annotated[str, Key("a model with a map", "The map by which its registers are read.")]
+    decode: Annotated[
+        dict[str, str],
+        Key(
+            'a table point = "reading", both named in the map',
+            "Another reading of a point than the document's, for units that differ from it.",
+        ),
+    ] = Field(default_factory=dict)
+
+
+class LineTable(Table):
+    """`[[line]]`: a serial port and the controllers on it."""
+
+    name: Annotated[Name, Key(_NAME, "What the line is called on every face; unique.")]
+    port: Annotated[
+        Annotated[str, AfterValidator(_port)],
+        Key(
+            "a device path such as /dev/serial/by-id/usb-FTDI_…, rfc2217://host:port or socket://host:port",
+            "The serial port; used by one line only, and locked.",
+        ),
+    ]
+    baudrate: Annotated[int, Key("300 to 230400", "Bits a second.")] = Field(default=_LINE.baudrate, ge=300, le=230400)
+    bytesize: Annotated[Literal[8], Key("8 (Modbus RTU has no other)", "Data bits.")] = 8
+    parity: Annotated[Literal["N", "E", "O"], Key('"N", "E" or "O"', "Parity: none, even or odd.")] = "N"
+    stopbits: Annotated[Literal[1, 2], Key("1 or 2", "Stop bits.")] = 2
+    reply_timeout_s: Annotated[
+        Seconds,
+        Key("0.05 to 10.0", "How long a controller may take before its reply begins."),
+    ] = Field(default=_LINE.reply_timeout_s, ge=0.05, le=10.0)
+    retries: Annotated[
+        int,
+        Key("0 to 5", "How often a client's read is repeated; a missed poll waits for its next turn."),
+    ] = Field(default=_LINE.retries, ge=0, le=5)
+    quarantine_s: Annotated[
+        Seconds,
+        Key("0.01 to 2.0", "Silence kept after a failure, so that a late reply is never taken for the next one."),
+    ] = Field(default=_LINE.quarantine_s, ge=0.01, le=2.0)
+    gap_s: Annotated[
+        Seconds,
+        Key("0.0 to 1.0", "Silence kept between frames; 3.5 characters are kept in any case."),
+    ] = Field(default=_LINE.gap_s, ge=0.0, le=1.0)
+    queue_limit: Annotated[
+        int,
+        Key("1 to 1000", "How many client reads may wait for the line; one more is answered 06."),
+    ] = Field(default=_LINE.queue_limit, ge=1, le=1000)
+    queue_limit_s: Annotated[
+        Seconds,
+        Key("0.1 to 60.0", "How long a client read may wait for the line; after that it is answered 0B."),
+    ] = Field(default=_LINE.queue_limit_s, ge=0.1, le=60.0)
+    device: Annotated[
+        Annotated[tuple[DeviceTable, ...], Field(strict=False)],
+        Key("one [[line.device]] table or more", "The controllers on the line."),
+    ] = Field(min_length=1)
+
+
+class PollTable(Table):
+    """`[poll]`: how often values are wanted; the line decides what is possible."""
+
+    live_s: Annotated[
+        Seconds,
+        Key("0.2 to 3600.0", "How often live values, energy and today's values are wanted."),
+    ] = Field(default=_POLL.live_s, ge=0.2, le=3600.0)
+    settings_s: Annotated[
+        Seconds,
+        Key("1.0 to 86400.0", "How often the controller's settings are wanted."),
+    ] = Field(default=_POLL.settings_s, ge=1.0, le=86400.0)
+
+
+class CacheTable(Table):
+    """`[cache]`: what may be answered from memory."""
+
+    max_age_s: Annotated[
+        Seconds,
+        Key("0.1 to 3600.0", "Registers older than this are never served as a Modbus reply."),
+    ] = Field(default=5.0, ge=0.1, le=3600.0)
+
+
+class ModbusTable(Table):
+    """`[modbus]`: the Modbus TCP face."""
+
+    listen: Annotated[Listens, Key(_LISTEN, "Where Modbus TCP clients connect.")] = ("127.0.0.1:1502",)
+    max_connections: Annotated[
+        int,
+        Key("1 to 1024", "How many clients may be connected at once, over all listen addresses."),
+    ] = Field(default=64, ge=1, le=1024)
+    allow: Annotated[Networks, Key(_NETWORK, "Who may connect; others are closed before a byte is read.")] = _LOOPBACK
+    strict_map: Annotated[
+        bool,
+        Key("true or false", "Answer 02 for ranges outside of the map without asking the controller."),
+    ] = False
+    writes: Annotated[bool, Key("false", "Writing to controllers; this version refuses every write.")] = False
+
+
+class CommunityTable(Table):
+    """`[[snmp.community]]`: who may read by SNMP v2c; none by default."""
+
+    name: Annotated[
+        Annotated[str, Field(pattern=r"^[!-~]{1,32}$")],
+        Key("1 to 32 printable ASCII characters without blanks", "The community name.", secret=True),
+    ]
+    source: Annotated[Networks, Key(_NETWORK + ", at least one", "From where it may be used.")] = Field(min_length=1)
+
+
+class SnmpTable(Table):
+    """`[snmp]`: the SNMP face; its port is opened only when there is a community."""
+
+    listen: Annotated[Listens, Key(_LISTEN, "Where the SNMP agent answers (UDP).")] = ("127.0.0.1:1161",)
+    enterprise_root: Annotated[
+        Annotated[str, AfterValidator(_root)],
+        Key(
+            'an OID of yours below 1.3.6.1.4.1, such as "1.3.6.1.4.1.32473.1"; never 33333, which is Morningstar\'s',
+            "Where the MIB hangs; 32473 is for documentation, use your own enterprise number in service.",
+        ),
+    ] = "1.3.6.1.4.1.32473.1"
+    contact: Annotated[Text, Key(_TEXT, "sysContact: whom to call.")] = ""
+    location: Annotated[Text, Key(_TEXT, "sysLocation: where the gateway is.")] = ""
+    community: Annotated[
+        Annotated[tuple[CommunityTable, ...], Field(strict=False)],
+        Key("[[snmp.community]] tables", "Who may read; without one nobody can."),
+    ] = ()
+
+
+class HttpTable(Table):
+    """`[http]`: /metrics, /healthz and /readyz."""
+
+    listen: Annotated[Listens, Key(_LISTEN, "Where Prometheus scrapes and health checks ask.")] = ("127.0.0.1:9850",)
+
+
+class Config(Table):
+    """The whole file."""
+
+    site: Annotated[Name, Key(_NAME, "The site's name, shown on every face.")]
+    state_dir: Annotated[
+        Annotated[str, Field(pattern=r"^/")],
+        Key("an absolute path", "Where later versions keep state; this version writes nothing."),
+    ] = "/var/lib/prostar-gateway"
+    line: Annotated[
+        Annotated[tuple[LineTable, ...], Field(strict=False)],
+        Key("one [[line]] table or more", "The serial lines."),
+    ] = Field(min_length=1)
+    poll: Annotated[PollTable, Key("a [poll] table", "How often values are wanted.")] = PollTable()
+    cache: Annotated[CacheTable, Key("a [cache] table", "What may be answered from memory.")] = CacheTable()
+    modbus: Annotated[ModbusTable, Key("a [modbus] table", "The Modbus TCP face.")] = ModbusTable()
+    snmp: Annotated[SnmpTable, Key("an [snmp] table", "The SNMP face.")] = SnmpTable()
+    http: Annotated[HttpTable, Key("an [http] table", "The HTTP face.")] = HttpTable()

@@ -1,0 +1,102 @@
+"""From the configuration to what lines, devices and faces are made of."""
+
+from __future__ import annotations
+
+import ipaddress
+
+from gateway.core.budget import LineBudget, line_budget
+from gateway.core.settings import LineSettings, PollSettings
+from gateway.core.site import Device
+from gateway.devices.schema import load_map
+from gateway.faces.http.settings import HttpSettings
+from gateway.faces.modbus.settings import ModbusSettings
+from gateway.faces.snmp.settings import Community, SnmpSettings
+from gateway.service.schema import Config, LineTable, parse_listen, parse_root
+
+Pairs = tuple[tuple[str, int], ...]
+
+STOP_GRACE_S = 1.0
+"""How long a stopping face waits for replies under way; the supervisor waits half a second longer."""
+
+
+def line_settings(config: Config) -> tuple[LineSettings, ...]:
+    """The settings of every line, in the order of the file."""
+    poll = PollSettings(live_s=config.poll.live_s, settings_s=config.poll.settings_s)
+    return tuple(
+        LineSettings(
+            name=line.name,
+            index=number,
+            port=line.port,
+            baudrate=line.baudrate,
+            bytesize=line.bytesize,
+            parity=line.parity,
+            stopbits=line.stopbits,
+            reply_timeout_s=line.reply_timeout_s,
+            retries=line.retries,
+            quarantine_s=line.quarantine_s,
+            gap_s=line.gap_s,
+            queue_limit=line.queue_limit,
+            queue_limit_s=line.queue_limit_s,
+            poll=poll,
+        )
+        for number, line in enumerate(config.line, start=1)
+    )
+
+
+def line_devices(line: LineTable) -> tuple[Device, ...]:
+    """New devices for one line, in the order of the file; their line sets itself."""
+    return tuple(
+        Device(
+            name=device.name,
+            unit_id=device.unit_id,
+            address=device.address,
+            map=load_map(device.model),
+            decode=dict(device.decode),
+        )
+        for device in line.device
+    )
+
+
+def line_budgets(config: Config) -> tuple[LineBudget, ...]:
+    """What each line can carry, in the order of the file."""
+    return tuple(
+        line_budget(settings, [load_map(device.model) for device in line.device])
+        for settings, line in zip(line_settings(config), config.line, strict=True)
+    )
+
+
+def modbus_settings(config: Config) -> ModbusSettings:
+    """The settings of the Modbus TCP face."""
+    modbus = config.modbus
+    return ModbusSettings(
+        listen=_pairs(modbus.listen),
+        max_connections=modbus.max_connections,
+        allow=tuple(ipaddress.ip_network(network) for network in modbus.allow),
+        max_age_s=config.cache.max_age_s,
+        strict_map=modbus.strict_map,
+        stop_grace_s=STOP_GRACE_S,
+    )
+
+
+def snmp_settings(config: Config) -> SnmpSettings:
+    """The settings of the SNMP face; without a community nothing listens, for nobody could be answered."""
+    snmp = config.snmp
+    return SnmpSettings(
+        listen=_pairs(snmp.listen) if snmp.community else (),
+        communities=tuple(
+            Community(community.name, tuple(ipaddress.ip_network(source) for source in community.source))
+            for community in snmp.community
+        ),
+        enterprise_root=parse_root(snmp.enterprise_root),
+        contact=snmp.contact,
+        location=snmp.location,
+    )
+
+
+def http_settings(config: Config) -> HttpSettings:
+    """The settings of the HTTP face."""
+    return HttpSettings(listen=_pairs(config.http.listen), stop_grace_s=STOP_GRACE_S)
+
+
+def _pairs(listens: tuple[str, ...]) -> Pairs:
+    return tuple((address.host, address.port) for address in map(parse_listen, listens))

@@ -1,0 +1,193 @@
+"""Supervision: failures stay alone, are retried with back-off, said once; stopping is in order."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import pytest
+
+from gateway.errors import ListenError
+from gateway.service import supervisor as module
+from gateway.service.supervisor import Supervisor
+
+
+class Time:
+    """Time that passes only in `sleep`."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.slept: list[float] = []
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def wall(self) -> float:
+        return self.now
+
+    async def sleep(self, seconds: float) -> None:
+        self.slept.append(seconds)
+        self.now += seconds
+        await asyncio.sleep(0)
+
+
+class FakeLine:
+    name = "a"
+
+    def __init__(self, time: Time, failures: int, runs_s: float = 0.0) -> None:
+        self.time, self.failures, self.runs_s = time, failures, runs_s
+        self.running = asyncio.Event()
+        self.cancelled = False
+
+    async def run(self) -> None:
+        if self.failures:
+            self.failures -= 1
+            self.time.now += self.runs_s
+            raise ZeroDivisionError("a bug")
+        self.running.set()
+        try:
+            await asyncio.Event().wait()
+        finally:
+            self.cancelled = True
+
+
+class FakeListener:
+    def __init__(self, label: str, errors: list[Exception] | None = None) -> None:
+        self.label = label
+        self.errors = errors or []
+        self.bound: tuple[str, int] | None = None
+        self.started = asyncio.Event()
+        self.on_stop: Callable[[], None] = lambda: None
+
+    async def start(self) -> None:
+        if self.errors:
+            raise self.errors.pop(0)
+        self.bound = ("127.0.0.1", 1)
+        self.started.set()
+
+    async def stop(self) -> None:
+        self.bound = None
+        self.on_stop()
+
+
+@asynccontextmanager
+async def running(supervisor: Supervisor) -> AsyncIterator[asyncio.Event]:
+    stop = asyncio.Event()
+    task = asyncio.create_task(supervisor.run(stop))
+    try:
+        yield stop
+    finally:
+        stop.set()
+        await task
+
+
+async def test_a_taken_address_is_said_once_and_tried_until_it_opens(caplog: pytest.LogCaptureFixture) -> None:
+    time = Time()
+    taken = FakeListener("modbus 127.0.0.1:1502", [ListenError("modbus 127.0.0.1:1502: taken")] * 8)
+    other = FakeListener("http 127.0.0.1:9850")
+    supervisor = Supervisor(time, [], [taken, other], sleep=time.sleep)
+    async with running(supervisor):
+        await other.started.wait()
+        assert not supervisor.ready
+        assert supervisor.down() == ("modbus 127.0.0.1:1502",)
+        await taken.started.wait()
+        await asyncio.sleep(0)
+        assert supervisor.ready
+    assert time.slept == [0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0, 10.0]
+    failed = [record for record in caplog.records if "listen_failed" in record.message]
+    assert [record.getMessage() for record in failed] == [
+        'event=listen_failed listener="modbus 127.0.0.1:1502" error="modbus 127.0.0.1:1502: taken" tries=1 next=retry'
+    ]
+    over = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert over == ['event=listening listener="modbus 127.0.0.1:1502" address=127.0.0.1:1 after_s=45.5']
+
+
+async def test_a_changed_reason_is_said_again(caplog: pytest.LogCaptureFixture) -> None:
+    time = Time()
+    listener = FakeListener("x", [ListenError("one"), ListenError("one"), ListenError("two")])
+    async with running(Supervisor(time, [], [listener], sleep=time.sleep)):
+        await listener.started.wait()
+    said = [record.getMessage() for record in caplog.records if "listen_failed" in record.message]
+    assert [text.partition("error=")[2] for text in said] == ['"one" tries=1 next=retry', '"two" tries=3 next=retry']
+
+
+async def test_a_bug_restarts_its_task_and_shows_its_traceback_once(caplog: pytest.LogCaptureFixture) -> None:
+    time = Time()
+    line, other = FakeLine(time, 3), FakeLine(time, 0)
+    other.name = "b"
+    supervisor = Supervisor(time, [line, other], [], sleep=time.sleep)
+    async with running(supervisor):
+        await line.running.wait()
+        assert supervisor.restarts == {"line a": 3}
+        assert other.running.is_set()
+    failed = [record for record in caplog.records if "task_failed" in record.message]
+    assert [record.exc_info is not None for record in failed] == [True, False, False]
+    assert (
+        failed[0].getMessage() == """event=task_failed task="line a" restarts=1 error="ZeroDivisionError('a bug')\""""
+    )
+    assert time.slept == [0.5, 1.0, 2.0]
+
+
+async def test_a_line_that_ran_for_long_starts_again_quickly() -> None:
+    time = Time()
+    line = FakeLine(time, 3, runs_s=module.STEADY_S + 1)
+    async with running(Supervisor(time, [line], [], sleep=time.sleep)):
+        await line.running.wait()
+    assert time.slept == [0.5, 0.5, 0.5]
+
+
+async def test_a_bug_in_a_listener_is_counted_and_retried() -> None:
+    time = Time()
+    listener = FakeListener("x", [ZeroDivisionError()])
+    supervisor = Supervisor(time, [], [listener], sleep=time.sleep)
+    async with running(supervisor):
+        await listener.started.wait()
+    assert supervisor.restarts == {"x": 1}
+
+
+async def test_listeners_stop_while_the_lines_still_run() -> None:
+    time = Time()
+    line, listener = FakeLine(time, 0), FakeListener("x")
+    seen: list[bool] = []
+    listener.on_stop = lambda: seen.append(line.cancelled)
+    async with running(Supervisor(time, [line], [listener], sleep=time.sleep)) as stop:
+        await line.running.wait()
+        await listener.started.wait()
+        await asyncio.sleep(0)
+        stop.set()
+    assert seen == [False]
+    assert line.cancelled
+
+
+async def test_what_does_not_stop_is_left_behind(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(module, "STOP_LISTENERS_S", 0.01)
+    release = asyncio.Event()
+
+    class Stubborn(FakeListener):
+        async def stop(self) -> None:
+            await release.wait()
+
+    stubborn = Stubborn("x")
+    supervisor = Supervisor(Time(), [], [stubborn])
+    async with running(supervisor):
+        await stubborn.started.wait()
+        await asyncio.sleep(0)
+    assert "event=stop_late" in caplog.text
+    release.set()
+    await asyncio.sleep(0)
+
+
+async def test_a_stop_that_fails_is_logged_and_nothing_else(caplog: pytest.LogCaptureFixture) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError
+
+    listener = FakeListener("x")
+    listener.on_stop = fail
+    async with running(Supervisor(Time(), [], [listener])):
+        await listener.started.wait()
+        await asyncio.sleep(0)
+    assert "event=stop_failed" in caplog.text
