@@ -38,6 +38,8 @@ def _functions(device_map: DeviceMap) -> Iterator[str]:
         for code, space in given.items():
             if known.get(code) is not space:
                 yield f"{key}: {code}: is no such function for {space.value}"
+    for space in {extent.space for extent in device_map.extents} - set(device_map.functions.values()):
+        yield f"functions: none reads {space.value}"
 
 
 def _extents(device_map: DeviceMap) -> Iterator[str]:

@@ -4,7 +4,7 @@ Rule 1: a block whose hourmeter is zero or all ones (24 or 32 bits) was never wr
 Rule 2: the document says high word first, units in the field were seen with the low word first. The right order
         is the one in which the hourmeters grow along the ring and none is ahead of the live hourmeter; while
         both would do, the document's holds. All 32-bit fields of a log share one order.
-Rule 3: the ring is cut where its hourmeter steps back, so one step back is natural and a second one is not.
+Rule 3: going once around the ring, the hourmeter steps back exactly once, from the newest day to the oldest.
 Rule 4: values come in base units: minutes become seconds.
 """
 
@@ -85,12 +85,9 @@ def detect_order(pairs: Sequence[Sequence[int]], live_hourmeter: int | None = No
 
 def _misfits(hours: Sequence[int], live_hourmeter: int | None) -> int:
     ahead = 0 if live_hourmeter is None else sum(hour > live_hourmeter for hour in hours)
-    steps_back = sum(later < earlier for earlier, later in pairwise(hours))
-    if len(hours) > 1 and steps_back == 1:
-        steps_back += hours[-1] > hours[0]  # a ring cut once: its end is older than its beginning
-    else:
-        steps_back = max(0, steps_back - 1)
-    return ahead + steps_back
+    around = [*hours, *hours[:1]]
+    steps_back = sum(later < earlier for earlier, later in pairwise(around))
+    return ahead + max(0, steps_back - 1)
 
 
 def _never_written(pair: Sequence[int]) -> bool:
