@@ -1,0 +1,315 @@
+"""The one description of the MIB: module structure, groups and tables, derived from the device maps.
+
+```
+root                     PROSTAR-GATEWAY-REG-MIB, the one configurable OID
+ ├ 1 modules             1 PROSTAR-GATEWAY-TC-MIB   2 PROSTAR-GATEWAY-MIB
+ │      2.1 objects      1 gateway 2 line 3 device 4 live 5 energy 6 today 7 settings 9 Modbus server
+ │      2.2 conformance  1 groups 2 compliances
+ └ 2 products            1 this gateway (sysObjectID)
+```
+
+The agent and the MIB generator both read it (docs/adr/0001), so it imports no SNMP library. Object 8 is for the
+condition table and everything past 9 for tables that grow with the log; notifications will hang at `2.0`.
+
+A point of a map becomes a column of its group's table by the number in the map. Points of one name share a column
+over all models; a disagreement about number, syntax, scale, units or labels is a `MapError`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from gateway.devices.model import Bit, DeviceMap, EnumValue, Group, Point
+from gateway.devices.schema import load_map, models
+from gateway.errors import MapError
+from gateway.faces.snmp import tables
+from gateway.faces.snmp.objects import (
+    CellValue,
+    Changes,
+    Convention,
+    DeviceRow,
+    ObjectType,
+    RowKind,
+    ScalarGroup,
+    Syntax,
+    Table,
+    in_range,
+)
+from gateway.faces.snmp.settings import DEFAULT_ROOT, Oid
+
+PREFIX = "pgw"
+NAME_LIMIT = 32
+"""RFC 4181 §3.1: descriptors should not be longer."""
+
+SHORT_WORDS: Mapping[str, str] = {
+    "absorption": "abs",
+    "compensation": "comp",
+    "compensated": "comp",
+    "equalization": "eq",
+    "equalize": "eq",
+    "extension": "ext",
+    "maximum": "max",
+    "minimum": "min",
+    "percent": "pct",
+    "reconnect": "reconn",
+    "disconnect": "disc",
+    "reference": "ref",
+    "regulation": "reg",
+    "resettable": "reset",
+    "temperature": "temp",
+    "threshold": "limit",
+    "voltage": "volt",
+}
+"""Shorter words for names that would pass NAME_LIMIT; only appended to, since names are for ever."""
+
+_POINT_TABLES: tuple[tuple[int, str, Group, str], ...] = (
+    (4, "pgwLive", Group.LIVE, "Live values of each device. A cell is instantiated only while the device is online."),
+    (5, "pgwEnergy", Group.ENERGY, "Energy and charge totals of each device, as counted by the device."),
+    (6, "pgwToday", Group.TODAY, "Values of the current day of each device, as kept by the device."),
+    (7, "pgwSettings", Group.SETTINGS, "Settings of each device, read now and then (see pgwDeviceSettingsAge)."),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The private part of the MIB under one root."""
+
+    root: Oid
+    groups: tuple[ScalarGroup, ...]
+    tables: tuple[Table, ...]
+    conventions: tuple[Convention, ...]  # by name
+
+    @property
+    def modules(self) -> Oid:
+        """Parent of the identities of the other modules."""
+        return (*self.root, 1)
+
+    @property
+    def module(self) -> Oid:
+        """Identity of PROSTAR-GATEWAY-MIB."""
+        return (*self.modules, 2)
+
+    @property
+    def objects(self) -> Oid:
+        """Parent of all groups and tables."""
+        return (*self.module, 1)
+
+    @property
+    def product(self) -> Oid:
+        """What sysObjectID says."""
+        return (*self.root, 2, 1)
+
+
+def layout(maps: Iterable[DeviceMap], root: Oid = DEFAULT_ROOT) -> Layout:
+    """Describe the MIB of all `maps` under `root`; MapError when two maps disagree about a column."""
+    objects: Oid = (*root, 1, 2, 1)
+    groups = (
+        ScalarGroup((*objects, 1), 1, "pgwGateway", "The gateway itself.", tables.GATEWAY),
+        ScalarGroup((*objects, 9), 9, "pgwModbus", "The Modbus TCP server since the start.", tables.MODBUS),
+    )
+    by_model = sorted(maps, key=lambda device_map: device_map.model)
+    columns = _Columns(by_model)
+    fixed = (
+        Table(
+            (*objects, 2),
+            2,
+            "pgwLine",
+            "The serial lines of the gateway, by their position in its configuration.",
+            RowKind.LINE,
+            "pgwLineIndex",
+            tables.LINE,
+        ),
+        Table(
+            (*objects, 3),
+            3,
+            "pgwDevice",
+            "The devices of the gateway, by unit id. Every row always answers, whatever the device does.",
+            RowKind.DEVICE,
+            "pgwDeviceUnitId",
+            tables.DEVICE,
+        ),
+    )
+    of_points = tuple(
+        Table(
+            (*objects, number),
+            number,
+            name,
+            description,
+            RowKind.DEVICE,
+            "pgwDeviceUnitId",
+            columns.of(group),
+            index_of="pgwDevice",
+        )
+        for number, name, group, description in _POINT_TABLES
+    )
+    in_use = {
+        column.convention.name: column.convention
+        for table in (*fixed, *of_points)
+        for column in table.columns
+        if column.convention is not None
+    }
+    conventions = tuple(in_use[name] for name in sorted(in_use))
+    return Layout(root, groups, tuple(table for table in (*fixed, *of_points) if table.columns), conventions)
+
+
+def shipped_layout(root: Oid = DEFAULT_ROOT) -> Layout:
+    """The MIB of every model that the gateway knows, under `root`."""
+    return layout((load_map(model) for model in models()), root)
+
+
+def camel(words: str) -> str:
+    """`battery_voltage` as `BatteryVoltage`."""
+    return "".join(word[:1].upper() + word[1:] for word in words.split("_"))
+
+
+def object_name(point: str) -> str:
+    """Descriptor of a point's column; MapError when even with short words it is too long."""
+    name = PREFIX + camel(point)
+    if len(name) > NAME_LIMIT:
+        name = PREFIX + camel("_".join(SHORT_WORDS.get(word, word) for word in point.split("_")))
+    if len(name) > NAME_LIMIT:
+        raise MapError(f"point {point}: {name} is longer than {NAME_LIMIT} letters; allowed: a shorter point name")
+    return name
+
+
+def label(name: str) -> str:
+    """`night_check` as the SMIv2 label `nightCheck`; MapError when it cannot be one."""
+    words = camel(name)
+    text = words[:1].lower() + words[1:]
+    if not re.fullmatch(r"[a-z][A-Za-z0-9]*", text):
+        raise MapError(f"{name!r} is no SMIv2 label: allowed are letters and digits, a letter first")
+    return text
+
+
+class _Columns:
+    """Columns of the point tables over all models."""
+
+    def __init__(self, maps: Sequence[DeviceMap]) -> None:
+        self._conventions = _conventions(maps)
+        self._columns: dict[tuple[Group, int], ObjectType] = {}
+        self._numbers: dict[str, tuple[Group, int]] = {}
+        self._scales: dict[str, int] = {}
+        for device_map in maps:
+            for point in device_map.points:
+                if point.mib is not None:
+                    self._add(device_map, point)
+
+    def of(self, group: Group) -> tuple[ObjectType, ...]:
+        """Columns of one table, by number."""
+        return tuple(self._columns[key] for key in sorted(self._columns) if key[0] is group)
+
+    def _add(self, device_map: DeviceMap, point: Point) -> None:
+        assert point.mib is not None
+        key = (point.group, point.mib.column)
+        where = f"{device_map.model}: point {point.name}"
+        if point.mib.column < 2:
+            raise MapError(f"{where}: column {point.mib.column}; allowed: 2 and above (1 is the index)")
+        if self._numbers.setdefault(point.name, key) != key:
+            raise MapError(f"{where}: another model has it in another table or column")
+        if self._scales.setdefault(point.name, point.mib.scale) != point.mib.scale:
+            raise MapError(f"{where}: another model has it with another scale")
+        column = self._column(device_map, point, where)
+        known = self._columns.get(key)
+        if known is None:
+            self._columns[key] = column
+            return
+        for field in ("name", "syntax", "units", "convention"):
+            if getattr(known, field) != getattr(column, field):
+                raise MapError(f"{where}: column {point.mib.column} of {point.group} already has another {field}")
+        assert known.models is not None
+        self._columns[key] = replace(known, models=known.models | {device_map.model})
+
+    def _column(self, device_map: DeviceMap, point: Point, where: str) -> ObjectType:
+        assert point.mib is not None
+        try:
+            syntax = Syntax(point.mib.syntax)
+        except ValueError:
+            raise MapError(f"{where}: syntax {point.mib.syntax!r} is not known") from None
+        convention = None
+        get: Callable[[DeviceRow, float], CellValue]
+        if syntax is Syntax.BITS:
+            convention = self._convention(point.bits, where)
+            get = _bits_getter(point.name, point.words)
+        elif syntax is Syntax.ENUMERATION:
+            convention = self._convention(point.enumeration, where)
+            get = _number_getter(point.name, 1, syntax)
+        elif syntax in {Syntax.INTEGER32, Syntax.UNSIGNED32}:
+            get = _number_getter(point.name, point.mib.scale, syntax)
+        else:
+            raise MapError(f"{where}: syntax {syntax} is not for points")
+        return ObjectType(
+            point.mib.column,
+            object_name(point.name),
+            syntax,
+            point.help,
+            get,
+            units=point.mib.units,
+            convention=convention,
+            changes=Changes.WITH_SNAPSHOT,
+            models=frozenset({device_map.model}),
+        )
+
+    def _convention(self, key: str | None, where: str) -> Convention:
+        if key is None or key not in self._conventions:
+            raise MapError(f"{where}: its syntax needs an enumeration or a bit table")
+        return self._conventions[key]
+
+
+def _conventions(maps: Sequence[DeviceMap]) -> dict[str, Convention]:
+    """The enumerations and bit tables of all maps; a number means the same in all of them."""
+    labels: dict[str, dict[int, tuple[str, str]]] = {}
+    syntaxes: dict[str, Syntax] = {}
+    for device_map in maps:
+        tables_of_map: list[tuple[str, Syntax, Sequence[EnumValue | Bit]]] = [
+            *((key, Syntax.ENUMERATION, values) for key, values in device_map.enumerations.items()),
+            *((key, Syntax.BITS, bits) for key, bits in device_map.bit_tables.items()),
+        ]
+        for key, syntax, values in tables_of_map:
+            if syntaxes.setdefault(key, syntax) is not syntax:
+                raise MapError(f"{device_map.model}: {key} is both an enumeration and a bit table")
+            known = labels.setdefault(key, {})
+            for value in values:
+                name = label(value.name)
+                if known.setdefault(value.number, (name, value.text))[0] != name:
+                    raise MapError(f"{device_map.model}: {key} {value.number} has another name in another model")
+            if len({name for name, _ in known.values()}) != len(known):
+                raise MapError(f"{device_map.model}: a label of {key} stands for two numbers")
+    return {
+        key: Convention(
+            # A suffix, because a type and an object may not differ in the case of one letter only.
+            "Pgw" + camel(key) + ("Code" if syntaxes[key] is Syntax.ENUMERATION else "Bits"),
+            syntaxes[key],
+            tuple((number, known[number][0]) for number in sorted(known)),
+            "Numbers are the device's own. "
+            + "; ".join(f"{known[number][0]}({number}): {known[number][1]}" for number in sorted(known))
+            + ".",
+        )
+        for key, known in labels.items()
+    }
+
+
+def _number_getter(point: str, scale: int, syntax: Syntax) -> Callable[[DeviceRow, float], CellValue]:
+    def get(row: DeviceRow, _now: float) -> CellValue:
+        value = row.device.snapshot.shown().get(point)
+        if value is None or not math.isfinite(value):
+            return None
+        number = round(value * scale)
+        return number if in_range(syntax, number) else None
+
+    return get
+
+
+def _bits_getter(point: str, words: int) -> Callable[[DeviceRow, float], CellValue]:
+    size = 16 * words
+
+    def get(row: DeviceRow, _now: float) -> CellValue:
+        value = row.device.snapshot.shown().get(point)
+        if value is None or not 0 <= value < 1 << size:
+            return None
+        # RFC 2578 §7.1.4: bit 0 is the most significant bit of the first octet.
+        return int(f"{int(value):0{size}b}"[::-1], 2).to_bytes(2 * words, "big")
+
+    return get
