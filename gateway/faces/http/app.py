@@ -101,7 +101,7 @@ class HttpFace:
 def _encoder(accept: str) -> tuple[Callable[[CollectorRegistry], bytes], str]:
     try:
         return choose_encoder(accept)
-    except ValueError:  # a version that is no number: the format that everybody reads
+    except (TypeError, ValueError):  # a version that is no number: the format that everybody reads
         return generate_latest, CONTENT_TYPE_PLAIN_0_0_4
 
 

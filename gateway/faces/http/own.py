@@ -170,6 +170,14 @@ MODBUS_RULES: tuple[Rule[ModbusServerStats], ...] = (
         lambda stats: {f"{code:02X}": count for code, count in stats.exceptions.items()},
     ),
     _each(
+        _gateway_counter("modbus_requests_refused", "Modbus TCP requests refused by policy, by reason.", "reason"),
+        lambda stats: stats.refused,
+    ),
+    _each(
+        _gateway_counter("modbus_connections_closed", "Modbus TCP connections the server ended, by reason.", "reason"),
+        lambda stats: stats.closed,
+    ),
+    _each(
         _gateway_counter("modbus_malformed", "Input that is no Modbus TCP, by reason.", "reason"),
         lambda stats: stats.malformed,
     ),

@@ -1,0 +1,113 @@
+"""The gateway's own counters as metrics."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import pytest
+
+from gateway import __version__
+from gateway.core.site import LineState, Site
+from gateway.core.stats import ModbusServerStats
+from gateway.faces.http.metric import MetricInfo, MetricKind
+from gateway.faces.http.own import ERROR_KINDS, OWN_METRICS, Counts, HttpStats, OwnCollector
+
+from .conftest import ManualClock, UnreadableLine
+
+
+def sample(site: Site, clock: ManualClock, counts: Counts, name: str, **labels: str) -> float:
+    """The one sample of that name and (at least) those labels."""
+    [value] = [
+        sample.value
+        for family in OwnCollector(site, clock, counts).collect()
+        for sample in family.samples
+        if sample.name == name and labels.items() <= sample.labels.items()
+    ]
+    return float(value)
+
+
+def test_line_counters(site: Site, clock: ManualClock) -> None:
+    line = site.lines[0]
+    assert isinstance(line, UnreadableLine)
+    line.stats.sent = 10
+    line.stats.ok = 7
+    line.stats.failed.update(timeout=2, offline=1)
+    line.stats.wire.noise_bytes = 5
+    line.stats.wire.echoes = 3
+    line.state = LineState.DOWN
+
+    def of_line(name: str, **labels: str) -> float:
+        return sample(site, clock, Counts(), f"prostar_gateway_line_{name}", line="shelter-a", **labels)
+
+    assert of_line("up") == 0
+    assert of_line("use_ratio") == 0.25
+    assert of_line("queue_depth") == 2
+    assert of_line("requests_total") == 10
+    assert of_line("replies_total") == 7
+    assert {kind: of_line("errors_total", kind=kind) for kind in (*ERROR_KINDS, "offline")} == {
+        "timeout": 2,
+        "crc": 0,
+        "mismatch": 0,
+        "exception": 0,
+        "offline": 1,
+    }
+    assert of_line("discarded_bytes_total", kind="noise") == 5
+    assert of_line("discarded_frames_total", kind="echo") == 3
+    assert sample(site, clock, Counts(), "prostar_gateway_line_up", line="shelter-b") == 1
+
+
+def test_device_counters(site: Site, clock: ManualClock) -> None:
+    site.devices[1].stats.polls = 4
+    site.devices[1].stats.implausible = 2
+    for name, value in (("polls", 4), ("implausible", 2), ("offline", 0)):
+        assert sample(site, clock, Counts(), f"prostar_gateway_device_{name}_total", unit_id="12") == value
+
+
+def test_face_counters(site: Site, clock: ManualClock) -> None:
+    modbus = ModbusServerStats(connections=3, open_connections=2, requests=9)
+    modbus.exceptions[0x0B] = 4
+    modbus.malformed["length"] = 1
+    counts = Counts(modbus, lambda: {"bad_community": 6}, HttpStats(scrapes=5, scrape_s=0.5))
+    for name, labels, value in (
+        ("modbus_connections", {}, 2),
+        ("modbus_connections_accepted_total", {}, 3),
+        ("modbus_requests_total", {}, 9),
+        ("modbus_exceptions_total", {"code": "0B"}, 4),
+        ("modbus_malformed_total", {"reason": "length"}, 1),
+        ("snmp_events_total", {"event": "bad_community"}, 6),
+        ("scrapes_total", {}, 5),
+        ("scrape_seconds_total", {}, 0.5),
+    ):
+        assert sample(site, clock, counts, f"prostar_gateway_{name}", **labels) == value
+
+
+def test_version_and_start(site: Site, clock: ManualClock) -> None:
+    collector = OwnCollector(site, clock, Counts())
+    clock.date += 60
+    found = {sample.name: sample for family in collector.collect() for sample in family.samples}
+    assert found["prostar_gateway_build_info"].labels["version"] == __version__
+    assert found["prostar_gateway_start_time_seconds"].value == clock.date - 60
+
+
+def test_what_is_collected_is_what_is_described(site: Site, clock: ManualClock) -> None:
+    modbus = ModbusServerStats()
+    modbus.exceptions[2] = 1
+    for reasons in (modbus.malformed, modbus.refused, modbus.closed):
+        reasons["because"] = 1
+    collector = OwnCollector(site, clock, Counts(modbus, lambda: {"get": 1}))
+
+    def collected() -> Iterator[tuple[str, str, str, tuple[str, ...]]]:
+        for family in collector.collect():
+            labels = {tuple(sample.labels) for sample in family.samples}
+            assert len(labels) == 1, f"{family.name} has samples with differing labels, or none"
+            yield family.samples[0].name, family.type, family.documentation, labels.pop()
+
+    assert list(collected()) == [(info.name, info.kind.value, info.help, info.labels) for info in OWN_METRICS]
+
+
+@pytest.mark.parametrize("info", OWN_METRICS, ids=lambda info: info.name)
+def test_descriptions_are_fit_to_be_documented(info: MetricInfo) -> None:
+    assert re.fullmatch(r"prostar_gateway(_[a-z]+)+", info.name)
+    assert info.name.endswith("_total") == (info.kind is MetricKind.COUNTER)
+    assert info.help.endswith(".")
