@@ -76,6 +76,12 @@ class QueueFull(Busy):
     label = "queue_full"
 
 
+class QueueTimeout(Busy):
+    """The request waited too long for its turn on the line."""
+
+    label = "queue_timeout"
+
+
 class ShuttingDown(Busy):
     """The gateway is stopping."""
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+from gateway.modbus.rtu import Timing
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,5 +31,10 @@ class LineSettings:
     quarantine_s: float = 0.1  # silence asked for after a failure before the line is used again
     gap_s: float = 0.0  # extra silence between frames for slow devices; never below 3.5 characters
     queue_limit: int = 64  # waiting client reads; over it exception 06
-    queue_limit_s: float = 5.0  # a client read that waited longer is answered 0B
+    queue_limit_s: float = 5.0  # a client read that waited longer is answered 06
     poll: PollSettings = PollSettings()
+
+    def timing(self) -> Timing:
+        """Wire times at this speed; the gap is the configured one where that is longer than 3.5 characters."""
+        timing = Timing.of(self.baudrate, self.bytesize, self.parity, self.stopbits)
+        return replace(timing, gap_s=max(timing.gap_s, self.gap_s))

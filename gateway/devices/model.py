@@ -218,6 +218,10 @@ class DeviceMap:
     log: LogLayout | None
     identity: IdentityRules
 
+    def read_function(self, space: Space) -> int:
+        """The function that polls read this space with: of those that the device has, the lowest."""
+        return min(function for function, read in self.functions.items() if read is space)
+
     def point(self, name: str) -> Point:
         """The point of that name; KeyError when the model has none."""
         for point in self.points:

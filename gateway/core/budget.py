@@ -1,0 +1,63 @@
+"""What a line can carry, before it is opened: its projected use and the refresh time of its devices.
+
+Every figure follows from the wire: characters at the line's speed, two gaps and the device's turnaround
+a transaction. The turnaround is not documented; `TURNAROUND_S` is assumed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gateway.core.settings import LineSettings
+from gateway.devices.model import DeviceMap, PollClass, Space
+from gateway.devices.plan import poll_plan
+from gateway.modbus.rtu import Timing
+
+TURNAROUND_S = 0.015
+REQUEST_BYTES = 8
+REPLY_OVERHEAD_BYTES = 5
+LONGEST_FRAME_BYTES = 256
+
+
+@dataclass(frozen=True, slots=True)
+class LineBudget:
+    """Projection for one line. `use_ratio` over 1 means that periods stretch by that factor."""
+
+    use_ratio: float
+    live_refresh_s: float  # how often each device's live values will be read
+    settings_refresh_s: float
+    reply_deadline_s: float  # a Modbus TCP client has its answer by then
+
+
+def line_budget(settings: LineSettings, maps: Sequence[DeviceMap]) -> LineBudget:
+    """Project the use of a line whose devices have these maps (one map a device)."""
+    timing = settings.timing()
+    period_s = {PollClass.LIVE: settings.poll.live_s, PollClass.SETTINGS: settings.poll.settings_s}
+    use = sum(
+        read_s(timing, block.space, block.count) / period_s[block.poll]
+        for device_map in maps
+        for block in poll_plan(device_map)
+    )
+    stretch = max(1.0, use)
+    attempt_s = (
+        timing.wire_s(REQUEST_BYTES)
+        + settings.reply_timeout_s
+        + timing.wire_s(LONGEST_FRAME_BYTES)
+        + settings.quarantine_s
+        + timing.gap_s
+    )
+    return LineBudget(
+        use_ratio=use,
+        live_refresh_s=settings.poll.live_s * stretch,
+        settings_refresh_s=settings.poll.settings_s * stretch,
+        # One transaction may be under way when the queue time ends.
+        reply_deadline_s=settings.queue_limit_s + (settings.retries + 2) * attempt_s,
+    )
+
+
+def read_s(timing: Timing, space: Space, count: int) -> float:
+    """Seconds of line time that one read of `count` registers or coils costs."""
+    payload = 2 * count if space is Space.REGISTERS else (count + 7) // 8
+    wire_s = timing.wire_s(REQUEST_BYTES) + timing.wire_s(REPLY_OVERHEAD_BYTES + payload)
+    return wire_s + 2 * timing.gap_s + TURNAROUND_S
