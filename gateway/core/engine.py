@@ -152,7 +152,15 @@ class LineEngine:
         job = self._scheduler.next(now)
         if job is None:
             return None
-        return self._send(job, now)
+        try:
+            frame = self._rtu.send(job.device.address, job.pdu, now, self.settings.reply_timeout_s)
+        except RequestError as error:  # a client's PDU that has no meaning on a serial line
+            if isinstance(job, ClientRead):
+                self._finish(job, error)
+                return self.step(now)
+            raise
+        self._sent(job, now)
+        return frame
 
     def bytes_due(self) -> int:
         """How many bytes of the awaited reply are at least still to come."""
@@ -193,7 +201,7 @@ class LineEngine:
             item.restart(now)
         record.polls.items = sorted(items + self._once(record.device, now), key=_rank)
 
-    def _send(self, job: Job, now: float) -> bytes:
+    def _sent(self, job: Job, now: float) -> None:
         self._job = job
         self._sent_at = now
         self.stats.sent += 1
@@ -206,7 +214,6 @@ class LineEngine:
             job.device.stats.polls += 1
             if job.period_s is not None:
                 job.due = now + job.period_s
-        return self._rtu.send(job.device.address, job.pdu, now, self.settings.reply_timeout_s)
 
     def _on_event(self, event: Replied | Failed, now: float) -> None:
         job, self._job = self._job, None

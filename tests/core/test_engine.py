@@ -21,6 +21,7 @@ from gateway.errors import (
     QueueTimeout,
     ReplyTimeout,
     ReplyUnusable,
+    RequestError,
 )
 from gateway.modbus.pdu import Function, ReadRequest
 from tests.core.virtual_line import MakeLine, VirtualLine
@@ -138,6 +139,16 @@ def test_nothing_but_reads_is_ever_sent(virtual_line: MakeLine, pdu: bytes) -> N
     line = virtual_line(Registers(1))
     assert isinstance(line.ask(line.devices[0], pdu), IllegalFunction)
     assert {frame[1] for _, frame in line.sent} <= {1, 2, 3, 4, 0x2B}
+
+
+@pytest.mark.parametrize("pdu", [b"\x03", b"\x03\0\0\0\0", b"\x03\xff\xff\0\2", b"\x2b", b"\x2b\x0d\1\0"])
+def test_a_read_without_meaning_is_refused_and_the_line_goes_on(virtual_line: MakeLine, pdu: bytes) -> None:
+    line = virtual_line(Registers(1))
+    line.run(1.0)
+    outcome = line.ask(line.devices[0], pdu)
+    assert isinstance(outcome, RequestError)
+    assert outcome.exception_code in {1, 2, 3}
+    assert isinstance(line.ask(line.devices[0], registers(0, 1)), bytes)
 
 
 def test_identical_reads_cost_one_transaction_and_every_waiter_gets_its_answer(virtual_line: MakeLine) -> None:
