@@ -86,13 +86,8 @@ class Supervisor:
         self._seen_bugs: set[str] = set()
         self.restarts: Counter[str] = Counter()  # task → how often a bug ended it
 
-    @property
-    def ready(self) -> bool:
-        """Whether every listener is open (a dead controller or line does not make the gateway unready)."""
-        return len(self._up) == len(self._listeners)
-
     def down(self) -> tuple[str, ...]:
-        """The labels of the listeners that are not open."""
+        """The labels of the listeners that are not open; none means ready, whatever lines and controllers do."""
         return tuple(listener.label for i, listener in enumerate(self._listeners) if i not in self._up)
 
     async def run(self, stop: asyncio.Event) -> None:

@@ -1,0 +1,75 @@
+"""`prostar-gateway check-config`: is the file right, and what will its lines be able to do?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from gateway.cli.config_file import ConfigOption, load_or_exit
+from gateway.core.budget import LineBudget
+from gateway.service.advice import advice
+from gateway.service.config import Config
+from gateway.service.settings import line_budgets
+
+
+def command(config: ConfigOption) -> None:
+    """Check a configuration: exit status 0 and a projection of its lines, or 78 and every problem."""
+    checked = load_or_exit(config)
+    budgets = line_budgets(checked)
+    console = Console()
+    console.print(_lines(checked, budgets), _devices(checked, budgets), sep="\n")
+    console.print(
+        f"Faces  Modbus TCP {_at(checked.modbus.listen)} · SNMP {_snmp(checked)} · HTTP {_at(checked.http.listen)}"
+    )
+    for text in advice(checked, budgets):
+        console.print(f"[yellow]warning[/] {escape(text)}", soft_wrap=True)
+    console.print(f"[green]{escape(str(config))} is right.[/]", soft_wrap=True)
+
+
+def _lines(config: Config, budgets: Sequence[LineBudget]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("line", overflow="fold")
+    table.add_column("port", overflow="fold")
+    for heading in ("devices", "use", "reply deadline"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for line, budget in zip(config.line, budgets, strict=True):
+        style = "red" if budget.use_ratio > 1 else ""
+        use = f"{budget.use_ratio:.0%}"
+        deadline = f"{budget.reply_deadline_s:.1f} s"
+        table.add_row(escape(line.name), escape(line.port), str(len(line.device)), use, deadline, style=style)
+    return table
+
+
+def _devices(config: Config, budgets: Sequence[LineBudget]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("unit id", justify="right", no_wrap=True)
+    for heading in ("device", "line"):
+        table.add_column(heading, overflow="fold")
+    table.add_column("address", justify="right", no_wrap=True)
+    table.add_column("model", overflow="fold")
+    for heading in ("live\nevery", "settings\nevery"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    rows = [(device, line, budget) for line, budget in zip(config.line, budgets, strict=True) for device in line.device]
+    for device, line, budget in sorted(rows, key=lambda row: row[0].unit_id):
+        table.add_row(
+            str(device.unit_id),
+            escape(device.name),
+            escape(line.name),
+            str(device.address),
+            device.model,
+            f"{budget.live_refresh_s:.1f} s",
+            f"{budget.settings_refresh_s:.0f} s",
+        )
+    return table
+
+
+def _at(listen: Sequence[str]) -> str:
+    return escape(", ".join(listen)) if listen else "off"
+
+
+def _snmp(config: Config) -> str:
+    return _at(config.snmp.listen) if config.snmp.community else "off (no community)"

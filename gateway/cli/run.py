@@ -1,0 +1,24 @@
+"""`prostar-gateway run`: the gateway itself, until a signal stops it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from gateway.cli.config_file import ConfigOption, load_or_exit
+from gateway.service.gateway import serve
+from gateway.service.logs import Level, set_up_logging
+from gateway.service.loops import Loop
+
+
+def command(
+    config: ConfigOption,
+    log_level: Annotated[
+        Level, typer.Option(help="From which level on events are logged to standard error.")
+    ] = Level.INFO,
+    loop: Annotated[Loop, typer.Option(help="The event loop; auto takes uvloop where it is installed.")] = Loop.AUTO,
+) -> None:
+    """Read the lines and serve the three faces until SIGTERM or Ctrl-C; exit status 78 for a bad configuration."""
+    set_up_logging(log_level)
+    serve(load_or_exit(config), loop)

@@ -1,0 +1,108 @@
+"""The gateway put together: lines, devices, three faces, one supervisor; and its life from start to signal.
+
+Rule 1: nothing is opened while it is built; a mistake here is a bad configuration or a bug, never a busy port.
+Rule 2: the first SIGTERM or SIGINT stops in order (service/supervisor.py), the second ends the process at once.
+        Both leave exit status 0.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import asdict
+
+from gateway import __version__
+from gateway.clock import Clock, SystemClock
+from gateway.core.site import Site
+from gateway.core.stats import ModbusServerStats
+from gateway.faces.http.app import HttpFace
+from gateway.faces.modbus.server import ModbusServer
+from gateway.faces.snmp.agent import SnmpAgent
+from gateway.lines.serial import SerialLine
+from gateway.service.advice import advice
+from gateway.service.config import Config
+from gateway.service.loops import Loop, loop_factory
+from gateway.service.settings import (
+    http_settings,
+    line_budgets,
+    line_devices,
+    line_settings,
+    modbus_settings,
+    snmp_settings,
+)
+from gateway.service.supervisor import Listener, Supervisor
+
+_log = logging.getLogger(__name__)
+
+
+class Gateway:
+    """All parts of one configuration."""
+
+    def __init__(self, config: Config, clock: Clock) -> None:
+        groups = [line_devices(line) for line in config.line]
+        self.lines = tuple(
+            SerialLine(settings, devices, clock)
+            for settings, devices in zip(line_settings(config), groups, strict=True)
+        )
+        self.site = Site.of(config.site, self.lines, [device for group in groups for device in group])
+        stats = ModbusServerStats()
+        modbus = ModbusServer(modbus_settings(config), self.site, clock, stats)
+        snmp = SnmpAgent(snmp_settings(config), self.site, clock, stats)
+        http = HttpFace(
+            http_settings(config),
+            self.site,
+            clock,
+            modbus=stats,
+            snmp=lambda: asdict(snmp.counters),
+            not_ready=self.not_ready,
+        )
+        self.listeners: tuple[Listener, ...] = (*modbus.listeners, *snmp.listeners, *http.listeners)
+        self.supervisor = Supervisor(clock, self.lines, self.listeners)
+
+    def not_ready(self) -> tuple[str, ...]:
+        """Why the gateway does not do what its configuration says: the listeners that are not open."""
+        return tuple(f"{label} is not open" for label in self.supervisor.down())
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Work until `stop` is set."""
+        await self.supervisor.run(stop)
+
+
+def serve(config: Config, loop: Loop = Loop.AUTO) -> None:
+    """Run the gateway until a signal stops it."""
+    with asyncio.Runner(loop_factory=loop_factory(loop)) as runner:
+        runner.run(_serve(config))
+
+
+async def _serve(config: Config) -> None:
+    running = asyncio.get_running_loop()
+    stop = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        running.add_signal_handler(number, _stopper(number, stop))
+    gateway = Gateway(config, SystemClock())
+    for text in advice(config, line_budgets(config)):
+        _log.warning('event=advice text="%s"', text.replace('"', "'"))
+    _log.info(
+        'event=started site="%s" version=%s lines=%d devices=%d loop=%s',
+        config.site,
+        __version__,
+        len(gateway.lines),
+        len(gateway.site.devices),
+        type(running).__module__.partition(".")[0],
+    )
+    await gateway.run(stop)
+    _log.info("event=stopped")
+
+
+def _stopper(number: signal.Signals, stop: asyncio.Event) -> Callable[[], None]:
+    def on_signal() -> None:
+        if stop.is_set():
+            logging.shutdown()
+            os._exit(0)  # whoever signals twice does not want to wait for anything
+        _log.info("event=stopping signal=%s", number.name)
+        stop.set()
+
+    return on_signal
