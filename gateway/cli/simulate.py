@@ -1,0 +1,106 @@
+"""`prostar-gateway simulate`: simulated controllers on ptys, until a signal stops it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from gateway.devices.schema import load_map
+from gateway.simulator.layout import DEMO_LAYOUT, Behaviour, LinePlan, SimulatedSite
+
+MODEL = "prostar-mppt"
+
+
+def command(
+    *,
+    line: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--line",
+            metavar="NAME=ADDR,ADDR",
+            help="A line and the addresses of its controllers; repeat for more lines. "
+            "Default: shelter-a=1,2 and shelter-b=1.",
+        ),
+    ] = None,
+    lines: Annotated[
+        int | None, typer.Option(min=1, max=64, help="Instead of --line: so many lines, line-1, line-2 …")
+    ] = None,
+    devices: Annotated[int, typer.Option(min=1, max=247, help="Controllers on each of --lines, addresses 1 …")] = 1,
+    speed: Annotated[float, typer.Option(min=0.001, max=3600, help="Seconds of their day per second.")] = 1.0,
+    start_hour: Annotated[float, typer.Option(min=0, max=24, help="Hour of the day to start at.")] = 8.0,
+    seed: Annotated[int, typer.Option(help="Same seed, same weather, same plants.")] = 0,
+    turnaround_ms: Annotated[float, typer.Option(min=0, max=1000, help="Time a controller takes to answer.")] = 15.0,
+    link_dir: Annotated[
+        Path | None,
+        typer.Option(exists=True, file_okay=False, writable=True, help="Make a symlink NAME to each pty there."),
+    ] = None,
+    oracle: Annotated[
+        bool, typer.Option("--oracle", help="Registers that encode device and address, instead of a solar day.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one line of JSON instead of a table.")] = False,
+) -> None:
+    """Run simulated ProStar MPPT controllers on ptys paced at 9600 8N2 and print where they are."""
+    try:
+        plans = _plans(line, lines, devices)
+        behaviour = Behaviour(seed, speed, start_hour, turnaround_ms / 1000, oracle)
+        site = SimulatedSite.build(load_map(MODEL), plans, behaviour, link_dir)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from error
+    try:
+        asyncio.run(_run(site, as_json))
+    except OSError as error:
+        Console(stderr=True).print(f"cannot make a pty: {error}", markup=False)
+        raise typer.Exit(1) from error
+
+
+def _plans(line: list[str] | None, lines: int | None, devices: int) -> tuple[LinePlan, ...]:
+    if line and lines is not None:
+        raise ValueError("--line and --lines exclude each other")
+    if line:
+        return tuple(LinePlan.parse(text) for text in line)
+    if lines is None:
+        return DEMO_LAYOUT
+    return tuple(LinePlan(f"line-{k + 1}", tuple(range(1, devices + 1))) for k in range(lines))
+
+
+async def _run(site: SimulatedSite, as_json: bool) -> None:
+    stopped = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stopped.set)
+    site.open()
+    try:
+        _announce(site, as_json)
+        await stopped.wait()
+    finally:
+        site.close()
+
+
+def _announce(site: SimulatedSite, as_json: bool) -> None:
+    """Tell the paths: a table for people, or one line `{"lines": [{"name", "port", "addresses"}]}` for programs."""
+    if as_json:
+        listed = [
+            {"name": plan.name, "port": line.path, "addresses": list(plan.addresses)}
+            for plan, line in zip(site.plans, site.lines, strict=True)
+        ]
+        print(json.dumps({"lines": listed}), flush=True)
+        return
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading in ("line", "port", "addresses"):
+        table.add_column(heading)
+    for plan, line in zip(site.plans, site.lines, strict=True):
+        table.add_row(plan.name, line.path, ", ".join(str(address) for address in plan.addresses))
+    console = Console()
+    console.print(table)
+    address, path = site.plans[0].addresses[0], site.lines[0].path
+    example = f"mbpoll -m rtu -b 9600 -P none -s 2 -a {address} -t 4:hex -0 -r 0 -c 82 -1 {path}"
+    console.print(f"Try: {example}", markup=False, soft_wrap=True, highlight=False)
+    console.print("Ctrl-C ends it.")
