@@ -240,11 +240,12 @@ class Client:
 
     async def rest(self) -> bytes:
         """What still comes until the server closes; a reset counts as closing."""
+        out = bytearray()
         async with asyncio.timeout(10):
-            try:
-                return await self.reader.read()
-            except ConnectionResetError:
-                return b""
+            with contextlib.suppress(ConnectionError):
+                while data := await self.reader.read(65536):
+                    out += data
+        return bytes(out)
 
     def reset(self) -> None:
         """Be gone at once: RST instead of FIN."""
