@@ -111,12 +111,12 @@ class Orders:
     equalize: bool = False
     slave_v: float = 0.0
     fixed_array_v: float = 0.0
-    fixed_array_share: float = 0.0
+    fixed_array_fraction: float = 0.0
 
     @property
     def fixes_array(self) -> bool:
         """Whether the array voltage is given and not tracked."""
-        return self.fixed_array_v > 0 or self.fixed_array_share > 0
+        return self.fixed_array_v > 0 or self.fixed_array_fraction > 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""The daily log as the unit keeps it: blocks in a ring, the newest over the oldest.
+"""A unit's past: its counters, and the daily log as it keeps it, blocks in a ring, the newest over the oldest.
 
 The order of the words in a 32-bit field is an option: high word first by the document, low word first
 as seen on units in the field. A unit younger than the ring has empty blocks: erased, and the one that will be
@@ -12,6 +12,7 @@ from collections.abc import Mapping
 
 from gateway.devices.codecs import encode
 from gateway.devices.model import LogLayout, Space, Value, WordOrder
+from gateway.simulator.day import Today, Totals
 from gateway.simulator.memory import ERASED, Memory
 from gateway.simulator.plant import Plant
 
@@ -40,12 +41,51 @@ class DailyLog:
         if self.written < layout.blocks:
             self._put(self.written, [0] * layout.block_words)
 
+    def fill_past(self, plant: Plant, dice: random.Random) -> None:
+        """Write the days since the unit was installed, as many as the ring holds."""
+        self.written = max(0, plant.age_days - self._layout.blocks)
+        for number in range(self.written, plant.age_days):
+            self.append(_past_day(plant, number, dice))
+
     def _put(self, number: int, words: list[int]) -> None:
         first = self._layout.first + number % self._layout.blocks * self._layout.block_words
         self._memory.store(Space.REGISTERS, first, *words)
 
 
-def past_day(plant: Plant, number: int, dice: random.Random) -> dict[str, Value]:
+def fields_of(hours: float, today: Today) -> dict[str, Value]:
+    """The log fields of a day that ended at that hourmeter."""
+    return {
+        "hourmeter": int(hours),
+        "alarms": today.alarms,
+        "load_faults": today.load_faults,
+        "array_faults": today.array_faults,
+        "battery_voltage_minimum": today.battery_min_v,
+        "battery_voltage_maximum": today.battery_max_v,
+        "charge": today.charge_ah,
+        "load_charge": today.load_ah,
+        "array_voltage_maximum": today.array_max_v,
+        "absorption_time": today.absorption_s,
+        "equalize_time": today.equalize_s,
+        "float_time": today.float_s,
+    }
+
+
+def past_totals(plant: Plant) -> Totals:
+    """Counters of a unit of that age: what the load took, and a little more from the array."""
+    used = plant.age_days * (24 * plant.base_load_a + 4.5 * plant.lamp_a)
+    energy = used * 1.12 * 13.4 * plant.multiplier / 1000
+    return Totals(
+        charge_ah=used * 1.12,
+        charge_ah_r=used * 0.31,
+        load_ah=used,
+        load_ah_r=used * 0.28,
+        charge_kwh=energy,
+        charge_kwh_r=energy * 0.28,
+        hours=24.0 * plant.age_days,
+    )
+
+
+def _past_day(plant: Plant, number: int, dice: random.Random) -> dict[str, Value]:
     """A plausible day of the unit's past; `number` 0 is the day it was installed."""
     sunny = dice.random() < 0.75
     lowest = plant.multiplier * dice.uniform(11.95, 12.35)

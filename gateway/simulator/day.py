@@ -181,7 +181,7 @@ class SolarDay:
         available_w = curve.pmax_w
         held_v = 0.0
         if self.orders.fixes_array:
-            held_v = self.orders.fixed_array_v or self.orders.fixed_array_share * curve.voc_v
+            held_v = self.orders.fixed_array_v or self.orders.fixed_array_fraction * curve.voc_v
             available_w = curve.power_at(held_v)
         charging = self.charger.stage in CHARGING and self._usable
         self._regulated = False
