@@ -103,15 +103,14 @@ class RtuClient:
     """The state machine of one line; see the rules of this module.
 
     The shell's moves: wait until `ready_at`, write what `send` returns, hand every read to `receive`, call
-    `on_timer` at `next_deadline`, call `reset` when the port was opened. `gap_s` is extra silence for slow
-    devices; less than the timing's gap has no effect. `echo` tells whether the line gives our requests back.
+    `on_timer` at `next_deadline`, call `reset` when the port was opened. `echo` tells whether the line gives our
+    requests back.
     """
 
-    def __init__(self, timing: Timing, counters: RtuCounters, *, quarantine_s: float, gap_s: float = 0.0) -> None:
+    def __init__(self, timing: Timing, counters: RtuCounters, *, quarantine_s: float) -> None:
         self._timing = timing
         self._counters = counters
-        self._gap_s = max(timing.gap_s, gap_s)
-        self._window = QuarantineWindow(max(quarantine_s, self._gap_s))
+        self._window = QuarantineWindow(max(quarantine_s, timing.gap_s))
         self._transaction: _Transaction | None = None
         self._state = State.IDLE
         self._quiet_from = -math.inf  # the last byte on the line, received or sent
@@ -135,7 +134,7 @@ class RtuClient:
         if self._transaction is not None:
             return math.inf
         self._advance(now)
-        until = self._until if self._state is State.QUARANTINED else self._quiet_from + self._gap_s
+        until = self._until if self._state is State.QUARANTINED else self._quiet_from + self._timing.gap_s
         return max(now, until)
 
     def send(self, address: int, pdu: bytes, now: float, timeout_s: float) -> bytes:
@@ -170,7 +169,7 @@ class RtuClient:
             return None
         reply = transaction.collector.take(data)
         if reply is None:
-            transaction.settle_at = now + self._gap_s + ADAPTER_HOLD_S
+            transaction.settle_at = now + self._timing.gap_s + ADAPTER_HOLD_S
             return None
         pdu, trailing = reply
         self._counters.late_bytes += trailing
