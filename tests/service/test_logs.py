@@ -51,10 +51,11 @@ def test_an_event_is_one_line_whatever_is_in_it(text: str) -> None:
 
 
 def test_a_traceback_follows_its_line() -> None:
+    record = logging.LogRecord("g", logging.ERROR, "", 0, "event=task_failed", (), None)
     try:
         _ = 1 / int("0")
     except ZeroDivisionError:
-        record = logging.LogRecord("g", logging.ERROR, "", 0, "event=task_failed", (), sys.exc_info())
+        record.exc_info = sys.exc_info()
     first, *rest = EventFormatter().format(record).splitlines()
     assert first.endswith("event=task_failed")
     assert rest[-1] == "ZeroDivisionError: division by zero"

@@ -1,0 +1,37 @@
+"""All commands under one name; each lives in its own module."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import Annotated
+
+import typer
+
+from gateway.cli import check_config, demo, generate, run, simulate
+
+app = typer.Typer(
+    help="Modbus TCP, SNMP and Prometheus for Morningstar ProStar MPPT controllers on serial lines.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,  # an operator's log wants the plain traceback
+)
+app.command("run")(run.command)
+app.command("check-config")(check_config.command)
+app.command("demo")(demo.command)
+app.command("simulate")(simulate.command)
+app.command("generate")(generate.command)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"prostar-gateway {version('prostar-gateway')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    pass

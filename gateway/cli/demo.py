@@ -1,0 +1,212 @@
+"""`prostar-gateway demo`: the main job on one screen, with simulated controllers on real ptys.
+
+The simulator and the gateway are two other processes, started by the same commands that anybody would use
+(`simulate`, `run`), and the picture is drawn from the gateway's own /metrics: nothing here looks behind the faces.
+
+Rule 1: Ctrl-C, SIGTERM and a closed terminal end everything within two seconds, with exit status 0.
+Rule 2: what cannot be done is said before anything is drawn: a taken port by its number and option.
+"""
+
+from __future__ import annotations
+
+import signal
+import socket
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from http.client import HTTPConnection, HTTPException
+from pathlib import Path
+from subprocess import Popen
+from types import FrameType
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.live import Live
+
+from gateway.cli.children import last_lines, start_gateway_command, stop_all
+from gateway.cli.demo_commands import COMMUNITY, Try, commands_to_try
+from gateway.cli.demo_screen import commands_text, fitting, plain_lines
+from gateway.cli.demo_view import MODEL, Rates, View, read_view
+
+HOST = "127.0.0.1"
+LAYOUT = {"shelter-a": (("array-1", 1, 11), ("array-2", 2, 12)), "shelter-b": (("array-3", 1, 13),)}
+"""Line → its controllers as (name, address, unit id): `simulate`'s own layout, two of them at the factory address."""
+
+SIMULATION = ("--speed", "120", "--start-hour", "8")
+"""A day in twelve minutes, from the morning on."""
+
+REFRESH_S = 1.0
+PLAIN_REFRESH_S = 5.0
+START_S = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Ports:
+    """Where the three faces of the demo are."""
+
+    modbus: int
+    snmp: int
+    http: int
+
+
+class DemoError(Exception):
+    """The demo cannot go on; the message is for people."""
+
+
+def command(
+    modbus_port: Annotated[int, typer.Option(min=1, max=65535, help="TCP port of the Modbus face.")] = 1502,
+    snmp_port: Annotated[int, typer.Option(min=1, max=65535, help="UDP port of the SNMP face.")] = 1161,
+    http_port: Annotated[int, typer.Option(min=1, max=65535, help="TCP port of the HTTP face.")] = 9850,
+) -> None:
+    """Run three simulated controllers on two serial lines, the gateway and its three faces, and watch them."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _setter(stop))
+    console = Console()
+    ports = Ports(modbus_port, snmp_port, http_port)
+    try:
+        _refuse_taken(ports)
+        with tempfile.TemporaryDirectory(prefix="prostar-demo-") as folder, _children() as children:
+            with console.status("Starting the simulated controllers and the gateway …"):
+                running = _started(Path(folder), ports, children, stop)
+            _show(running, ports, console, stop)
+    except DemoError as error:
+        print(error, file=sys.stderr)
+        raise typer.Exit(1) from None
+    except BrokenPipeError:  # nobody reads any more: `demo | head`
+        sys.stderr.close()
+        raise typer.Exit(0) from None
+
+
+def _setter(stop: threading.Event) -> Callable[[int, FrameType | None], None]:
+    return lambda _number, _frame: stop.set()
+
+
+def _refuse_taken(ports: Ports) -> None:
+    wanted = (
+        ("Modbus TCP", "--modbus-port", ports.modbus, socket.SOCK_STREAM),
+        ("SNMP (UDP)", "--snmp-port", ports.snmp, socket.SOCK_DGRAM),
+        ("HTTP", "--http-port", ports.http, socket.SOCK_STREAM),
+    )
+    problems = []
+    for face, option, port, kind in wanted:
+        with socket.socket(socket.AF_INET, kind) as probe:
+            if kind is socket.SOCK_STREAM:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((HOST, port))
+            except OSError as error:
+                problems.append(f"{face} port {HOST}:{port}: {error.strerror}. Choose another: {option} {port + 1}")
+    if problems:
+        raise DemoError("\n".join(problems))
+
+
+@contextmanager
+def _children() -> Iterator[list[Popen[bytes]]]:
+    children: list[Popen[bytes]] = []
+    try:
+        yield children
+    finally:
+        stop_all(children)
+
+
+class _Running:
+    """The two processes and the scrapes of the gateway."""
+
+    def __init__(self, folder: Path, ports: Ports, children: Sequence[Popen[bytes]]) -> None:
+        self.folder = folder
+        self._ports = ports
+        self._children = children
+
+    def scrape(self) -> View | None:
+        """The view of now, or None when the gateway does not answer; DemoError when a process has ended."""
+        self.check()
+        connection = HTTPConnection(HOST, self._ports.http, timeout=0.5)
+        try:
+            connection.request("GET", "/metrics")
+            return read_view(connection.getresponse().read().decode())
+        except (OSError, HTTPException):
+            return None
+        finally:
+            connection.close()
+
+    def check(self) -> None:
+        """DemoError when a process has ended, with the end of its log."""
+        for child, name in zip(self._children, ("simulate", "run"), strict=False):
+            if child.poll() is not None:
+                log = "\n".join(last_lines(self.folder / f"{name}.log"))
+                raise DemoError(f"prostar-gateway {name} ended with status {child.returncode}:\n{log}")
+
+
+def _started(folder: Path, ports: Ports, children: list[Popen[bytes]], stop: threading.Event) -> _Running:
+    """Start simulator and gateway; returns when the first live values are there (or a signal came)."""
+    running = _Running(folder, ports, children)
+    with (folder / "simulate.log").open("wb") as log:
+        children.append(start_gateway_command(["simulate", "--link-dir", str(folder), *SIMULATION], log, stdout=log))
+    began = time.monotonic()
+    while not stop.is_set() and not all((folder / line).exists() for line in LAYOUT):
+        running.check()
+        _not_longer_than(began, "the simulated lines to appear")
+        stop.wait(0.02)
+    config = folder / "demo.toml"
+    config.write_text(demo_config(folder, ports))
+    with (folder / "run.log").open("wb") as log:
+        children.append(start_gateway_command(["run", "-c", str(config)], log, stdout=log))
+    while not stop.is_set() and not _all_online(running.scrape()):
+        _not_longer_than(began, "the controllers to answer")
+        stop.wait(0.1)
+    return running
+
+
+def _all_online(view: View | None) -> bool:
+    return view is not None and all(device.quality == "online" for device in view.devices)
+
+
+def _not_longer_than(began: float, what: str) -> None:
+    if time.monotonic() - began > START_S:
+        raise DemoError(f"Waited {START_S:.0f} s for {what}.")
+
+
+def demo_config(folder: Path, ports: Ports) -> str:
+    """The configuration of the demo; the lines are the simulator's links in `folder`."""
+    text = f'site = "demo"\nstate_dir = "{folder}"\n'
+    for line, devices in LAYOUT.items():
+        text += f'\n[[line]]\nname = "{line}"\nport = "{folder / line}"\n'
+        for name, address, unit in devices:
+            text += f'[[line.device]]\nname = "{name}"\naddress = {address}\nunit_id = {unit}\nmodel = "{MODEL}"\n'
+    text += f'\n[modbus]\nlisten = ["{HOST}:{ports.modbus}"]\n\n[snmp]\nlisten = ["{HOST}:{ports.snmp}"]\n'
+    text += f'[[snmp.community]]\nname = "{COMMUNITY}"\nsource = ["127.0.0.0/8"]\n'
+    return text + f'\n[http]\nlisten = ["{HOST}:{ports.http}"]\n'
+
+
+def _show(running: _Running, ports: Ports, console: Console, stop: threading.Event) -> None:
+    commands = commands_to_try(ports.modbus, ports.snmp, ports.http, Path.cwd())
+    if console.is_terminal:
+        _show_tables(running, commands, console, stop)
+    else:
+        _show_lines(running, commands, stop)
+
+
+def _show_tables(running: _Running, commands: Sequence[Try], console: Console, stop: threading.Event) -> None:
+    rates = Rates()
+    with Live(console=console, auto_refresh=False, vertical_overflow="crop") as live:
+        while not stop.is_set():
+            view = running.scrape()
+            if view is not None:
+                live.update(fitting(view, rates.add(view, time.monotonic()), commands, console), refresh=True)
+            stop.wait(REFRESH_S)
+
+
+def _show_lines(running: _Running, commands: Sequence[Try], stop: threading.Event) -> None:
+    print(commands_text(commands, labels=True).plain, flush=True)
+    rates = Rates()
+    while not stop.is_set():
+        view = running.scrape()
+        if view is not None:
+            print("\n".join(plain_lines(view, rates.add(view, time.monotonic()))), flush=True)
+        stop.wait(PLAIN_REFRESH_S)

@@ -1,0 +1,27 @@
+"""The command `prostar-gateway`: takes over the signals, then loads the commands.
+
+Loading them takes most of a second, and a signal in that time must end the program as quietly as later. So this
+file imports nothing but the standard library before the handlers stand.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from types import FrameType
+
+UNTIL_STOPPED = ("run", "demo", "simulate")
+"""Commands that run until a signal ends them; for the others a signal is an interruption."""
+
+
+def main() -> None:
+    """Run the command line."""
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, _leave)
+    from gateway.cli.app import app  # noqa: PLC0415 - only now are signals handled
+
+    app(prog_name="prostar-gateway")
+
+
+def _leave(number: int, _frame: FrameType | None) -> None:
+    raise SystemExit(0 if sys.argv[1:] and sys.argv[1] in UNTIL_STOPPED else 128 + number)
