@@ -70,7 +70,7 @@ command -v apt-get >/dev/null || refuse "There is no apt-get here."
 root=()
 if ((EUID != 0)); then
   if ! { command -v sudo >/dev/null && sudo -n true 2>/dev/null; }; then
-    refuse "They cannot be installed for you: not root, and sudo asks for a password."
+    refuse "They cannot be installed for you: neither root nor sudo without a password."
   fi
   root=(sudo -n)
 fi
