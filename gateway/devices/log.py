@@ -3,7 +3,8 @@
 Rule 1: a block whose hourmeter is zero or all ones (24 or 32 bits) was never written and is left out.
 Rule 2: the document says high word first, units in the field were seen with the low word first. The right order
         is the one in which the hourmeters grow along the ring and none is ahead of the live hourmeter; while
-        both would do, the document's holds. All 32-bit fields of a log share one order.
+        both would do, the one whose days lie closer together, and then the document's. All 32-bit fields of a
+        log share one order.
 Rule 3: going once around the ring, the hourmeter steps back exactly once, from the newest day to the oldest.
 Rule 4: values come in base units: minutes become seconds.
 """
@@ -77,10 +78,11 @@ def decode_log(layout: LogLayout, blocks: Mapping[int, bytes], live_hourmeter: i
 
 def detect_order(pairs: Sequence[Sequence[int]], live_hourmeter: int | None = None) -> tuple[WordOrder, bool]:
     """The word order of hourmeter words given in ring order, and whether it is the only one that fits."""
-    scores = {order: _misfits([combine(pair, order) for pair in pairs], live_hourmeter) for order in WordOrder}
-    documented, other = scores[WordOrder.HI_LO], scores[WordOrder.LO_HI]
-    order = WordOrder.LO_HI if other < documented else WordOrder.HI_LO
-    return order, min(scores.values()) == 0 < max(scores.values())
+    hours = {order: [combine(pair, order) for pair in pairs] for order in WordOrder}
+    misfits = {order: _misfits(hours[order], live_hourmeter) for order in WordOrder}
+    spans = {order: max(hours[order], default=0) - min(hours[order], default=0) for order in WordOrder}
+    order = min((WordOrder.HI_LO, WordOrder.LO_HI), key=lambda order: (misfits[order], spans[order]))
+    return order, min(misfits.values()) == 0 < max(misfits.values())
 
 
 def _misfits(hours: Sequence[int], live_hourmeter: int | None) -> int:
