@@ -19,6 +19,7 @@ from gateway.simulator.memory import Memory
 from gateway.simulator.panel import Labels, publish, store_totals
 from gateway.simulator.plant import PLANTS, Plant
 from gateway.simulator.server import Controller, missing
+from gateway.simulator.sky import DAY_S
 
 DEFAULT_TURNAROUND_S = 0.015
 
@@ -74,7 +75,6 @@ class SimulatedController(Controller):
             step_s=step_s,
             totals=past_totals(self.plant),
         )
-        self._stored_at_day = self._hourmeter_day()
         self._commands = Commands(self._memory, self.day, self._labels, firmware)
         self._commands.boot()
         self._publish()
@@ -100,10 +100,10 @@ class SimulatedController(Controller):
             self._born = now - self.day.at_s / self._speed
         changed = False
         if now > self._commands.slave_deadline:
-            self.day.advance((self._commands.slave_deadline - self._born) * self._speed)
+            self._live_until((self._commands.slave_deadline - self._born) * self._speed)
             self._commands.slave_timed_out()
             changed = True
-        if self.day.advance((now - self._born) * self._speed) or changed:
+        if self._live_until((now - self._born) * self._speed) or changed:
             self._publish()
 
     def read(self, space: Space, first: int, count: int, now: float) -> list[int]:
@@ -155,8 +155,13 @@ class SimulatedController(Controller):
         daily_log.fill_past(self.plant, random.Random(f"{self._seed}/log"))  # noqa: S311  the past is no secret
         return daily_log
 
-    def _hourmeter_day(self) -> int:
-        return int(self.day.totals.hours // 24)
+    def _live_until(self, at_s: float) -> bool:
+        """Move the day, and store the totals at each midnight on the way; whether anything changed."""
+        for number in range(int(self.day.at_s // DAY_S) + 1, int(at_s // DAY_S) + 1):
+            self.day.advance(number * DAY_S)
+            self._publish()
+            store_totals(self._memory)
+        return self.day.advance(at_s)
 
     def _publish(self) -> None:
         self.day.show_faults()
@@ -165,9 +170,6 @@ class SimulatedController(Controller):
             for hours, today in self.day.closed:
                 self._log.append(fields_of(hours, today))
         self.day.closed.clear()
-        if self._hourmeter_day() != self._stored_at_day:
-            self._stored_at_day = self._hourmeter_day()
-            store_totals(self._memory)
 
 
 def _serial_extent(device_map: DeviceMap, serial_number: str | None) -> tuple[Extent, ...]:
