@@ -23,6 +23,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -37,6 +38,20 @@ class Server:
 
     name: str
     command: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Load:
+    """So many clients, each with so many requests under way."""
+
+    connections: int
+    depth: int
+
+    @classmethod
+    def of(cls, text: str) -> Load:
+        """From `CONNECTIONSxPIPELINED`."""
+        connections, _, depth = text.partition("x")
+        return cls(int(connections), int(depth))
 
 
 @dataclass(frozen=True)
@@ -65,7 +80,7 @@ def servers(build: Path) -> list[Server]:
     if find_spec("uvloop"):
         out.append(Server("gateway, uvloop", (python, str(HERE / "gateway_server.py"), "PORT", "uvloop")))
     else:
-        print("left out: uvloop is not installed")
+        say("left out: uvloop is not installed")
     out.append(Server("pymodbus", (python, str(HERE / "pymodbus_server.py"), "PORT")))
     flags = subprocess.run(
         ["pkg-config", "--cflags", "--libs", "libmodbus"], capture_output=True, text=True, check=False
@@ -73,8 +88,14 @@ def servers(build: Path) -> list[Server]:
     if flags.returncode == 0:
         out.append(Server("libmodbus", (compiled("libmodbus_server.c", build, *flags.stdout.split()), "PORT")))
     else:
-        print("left out: libmodbus (Debian package libmodbus-dev) is not installed")
+        say("left out: libmodbus (Debian package libmodbus-dev) is not installed")
     return out
+
+
+def say(text: str) -> None:
+    """To standard output, at once."""
+    sys.stdout.write(text + "\n")
+    sys.stdout.flush()
 
 
 def free_port() -> int:
@@ -111,10 +132,10 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def measure(load: str, server: Server, connections: int, depth: int, seconds: float, cores: tuple[int, int]) -> Run:
+def measure(generator: str, server: Server, load: Load, seconds: float, cores: tuple[int, int]) -> Run:
     """One run of the load generator against a fresh server."""
     with running(server, cores[0]) as (pid, port):
-        command = ["taskset", "-c", str(cores[1]), load, str(port), str(connections), str(depth)]
+        command = ["taskset", "-c", str(cores[1]), generator, str(port), str(load.connections), str(load.depth)]
         subprocess.run([*command, "0.3", str(UNITS)], check=True, stdout=subprocess.DEVNULL)  # warm up
         before = cpu_s(pid)
         done = subprocess.run([*command, str(seconds), str(UNITS)], check=True, capture_output=True, text=True)
@@ -134,23 +155,37 @@ def measure(load: str, server: Server, connections: int, depth: int, seconds: fl
 def table(runs: dict[str, list[Run]]) -> str:
     """Medians over the rounds; ratios are medians of the ratios within a round."""
     peers = [name for name in ("libmodbus", "pymodbus") if name in runs]
-    head = ["server", "replies/s", "CPU µs a reply", "p50 µs", "p99 µs", "lost", "wrong", *(f"× {peer}" for peer in peers)]
+    head = ["server", "replies/s", *(f"× {peer}" for peer in peers), "CPU µs a reply", *(f"÷ {peer}" for peer in peers)]
+    head += ["p50 µs", "p99 µs", "lost", "wrong"]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for name, own in runs.items():
+        pairs = [list(zip(own, runs[peer], strict=True)) for peer in peers]
         cells = [
             name,
             f"{statistics.median(run.rate for run in own):,.0f}",
+            *(f"{statistics.median(a.rate / b.rate for a, b in pair):.2f}" for pair in pairs),
             f"{statistics.median(run.cpu_us for run in own):.1f}",
+            *(f"{statistics.median(a.cpu_us / b.cpu_us for a, b in pair):.2f}" for pair in pairs),
             f"{statistics.median(run.p50_us for run in own):,.0f}",
             f"{statistics.median(run.p99_us for run in own):,.0f}",
             str(sum(run.lost for run in own)),
             str(sum(run.wrong for run in own)),
         ]
-        for peer in peers:
-            ratios = [run.rate / other.rate for run, other in zip(own, runs[peer], strict=True)]
-            cells.append(f"{statistics.median(ratios):.2f}")
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def where() -> str:
+    """Date and machine, without which no figure means anything."""
+    processor = platform.machine()
+    with contextlib.suppress(OSError, StopIteration):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        processor = next(line for line in lines if line.startswith("model name")).partition(":")[2].strip()
+    cores = len(os.sched_getaffinity(0))
+    return (
+        f"{datetime.now(UTC):%Y-%m-%d}, {processor}, {cores} cores,"
+        f" {platform.system()} {platform.release()}, Python {platform.python_version()}"
+    )
 
 
 def main() -> None:
@@ -166,19 +201,15 @@ def main() -> None:
     usable = sorted(os.sched_getaffinity(0))
     cores = (usable[0], usable[-1])
     with tempfile.TemporaryDirectory(prefix="bench-") as folder:
-        load = compiled("modbus_load.c", Path(folder))
+        generator = compiled("modbus_load.c", Path(folder))
         field = servers(Path(folder))
-        print(
-            f"\nFC03 × 80 registers, {options.rounds} rounds of {options.seconds:g} s;"
-            f" {len(usable)} cores, {platform.machine()}, Python {platform.python_version()}"
-        )
-        for shape in options.loads:
-            connections, depth = (int(part) for part in shape.split("x"))
+        say(f"\nFC03 × 80 registers, {options.rounds} rounds of {options.seconds:g} s a server; {where()}")
+        for load in map(Load.of, options.loads):
             runs: dict[str, list[Run]] = {server.name: [] for server in field}
             for _ in range(options.rounds):
                 for server in field:
-                    runs[server.name].append(measure(load, server, connections, depth, options.seconds, cores))
-            print(f"\n{connections} connections × {depth} pipelined\n\n{table(runs)}", flush=True)
+                    runs[server.name].append(measure(generator, server, load, options.seconds, cores))
+            say(f"\n{load.connections} connections × {load.depth} under way\n\n{table(runs)}")
 
 
 if __name__ == "__main__":
