@@ -100,13 +100,3 @@ async def test_an_asker_that_is_gone_does_not_stop_the_server(make_agent: Callab
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
                 gone.sendto(request(v2c.GetRequestPDU, SYS_DESCR), bound)
         assert Reply(await exchange(bound, request(v2c.GetRequestPDU, SYS_DESCR))).status == 0
-
-
-def test_the_documentation_number_is_warned_about(
-    make_agent: Callable[..., SnmpAgent], caplog: pytest.LogCaptureFixture
-) -> None:
-    make_agent()
-    assert "snmp_enterprise_root number=32473" in caplog.text
-    caplog.clear()
-    make_agent(enterprise_root=(1, 3, 6, 1, 4, 1, 99999, 1))
-    assert "snmp_enterprise_root" not in caplog.text

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import pytest
 
-from gateway.core.site import Site
-from gateway.core.snapshot import DeviceState
+from gateway.core.site import Device, Site
+from gateway.core.snapshot import DeviceState, Snapshot
+from gateway.core.stats import ModbusServerStats
 from gateway.devices.model import DeviceMap
 from gateway.faces.snmp.agent import SnmpAgent
 from gateway.faces.snmp.objects import Syntax
-from gateway.faces.snmp.settings import Oid
+from gateway.faces.snmp.settings import Oid, SnmpSettings
 from gateway.faces.snmp.wire import object_identifier, value, varbind
-from tests.faces.snmp.stub_site import StubClock, online, stale
+from tests.faces.snmp.stub_site import StubClock, StubLine, online, stale
 
 LIVE = (1, 3, 6, 1, 4, 1, 32473, 1, 1, 2, 1, 4, 1)
 BATTERY_VOLTAGE = 9
@@ -22,6 +24,7 @@ BATTERY_VOLTAGE = 9
 def walk(agent: SnmpAgent, now: float) -> list[Oid]:
     found: list[Oid] = []
     at: Oid = (0, 0)
+    agent.tree.refresh()
     while (step := agent.tree.after(at, now)) is not None:
         at = step[0]
         found.append(at)
@@ -77,6 +80,46 @@ def test_values_of_a_stale_device_vanish_and_come_back(
     assert gone == {oid for oid in whole if oid[-1] == 11 and oid[: len(LIVE) - 1][-1] in {4, 5, 6, 7}}
     assert len(gone) > 90
     assert walk(agent, clock.now) == whole
+
+
+def test_one_point_can_come_and_go(agent: SnmpAgent, site: Site, clock: StubClock) -> None:
+    device = site.by_unit[11]
+    oid = (*LIVE, BATTERY_VOLTAGE, 11)
+    whole, full = walk(agent, clock.now), device.snapshot
+    fewer = {name: shown for name, shown in full.values.items() if name != "battery_voltage"}
+    for version in range(2, 6):
+        device.snapshot = replace(full, version=version, values=fewer if version % 2 == 0 else full.values)
+        assert walk(agent, clock.now) == [each for each in whole if version % 2 or each != oid]
+
+
+def test_a_point_that_a_device_shows_for_the_first_time_appears(
+    agent: SnmpAgent, site: Site, device_map: DeviceMap, clock: StubClock
+) -> None:
+    device = site.by_unit[12]
+    device.snapshot = Snapshot(state=DeviceState.ONLINE, values={"battery_voltage": 12.0})
+    first = [oid for oid in walk(agent, clock.now) if oid[-1] == 12]
+    device.snapshot = online(device_map, 12)
+    later = [oid for oid in walk(agent, clock.now) if oid[-1] == 12]
+    assert (*LIVE, BATTERY_VOLTAGE, 12) in first
+    assert set(first) < set(later)
+    assert len(later) > len(first) + 90
+
+
+def test_a_step_over_a_site_of_silent_devices_is_short(
+    device_map: DeviceMap, settings: SnmpSettings, clock: StubClock, modbus_stats: ModbusServerStats
+) -> None:
+    """200 devices that show nothing are 21,000 cells; a step must not look at each of them."""
+    line = StubLine("a", 1, "/dev/ttyA")
+    devices = [Device(f"d{unit}", unit, unit, device_map) for unit in range(1, 201)]
+    for device in devices:
+        device.line = line
+    tree = SnmpAgent(settings, Site.of("big", (line,), devices), clock, modbus_stats).tree
+    tree.refresh()
+    before = time.perf_counter()
+    steps = [tree.after(LIVE, clock.now) for _ in range(100)]
+    assert time.perf_counter() - before < 0.1
+    assert steps[0] is not None
+    assert steps[0][0][:-2] == (*LIVE[:-2], 9)
 
 
 @pytest.mark.parametrize("state", list(DeviceState))
