@@ -26,7 +26,9 @@ class Client:
         return self.controller.handle(bytes(pdu), self.now)
 
     def request(self, function: int, address: int, value: int) -> bytes | None:
-        return self.controller.handle(bytes([function, *address.to_bytes(2, "big"), *value.to_bytes(2, "big")]), self.now)
+        return self.controller.handle(
+            bytes([function, *address.to_bytes(2, "big"), *value.to_bytes(2, "big")]), self.now
+        )
 
     def words(self, first: int, count: int, function: int = 3) -> list[int]:
         reply = self.request(function, first, count)
