@@ -1,0 +1,221 @@
+"""The three faces say the same, to clients that are nobody's mock: net-snmp, Prometheus, pymodbus.
+
+The registers read over Modbus are decoded here by the words of the document, not by the gateway's code.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+import subprocess
+import urllib.request
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from pymodbus.client import ModbusTcpClient
+
+from gateway.devices.model import DeviceMap, Group, Point, Space, WordOrder
+from gateway.devices.schema import load_map
+from tests.e2e.programs import DEMO_DEVICES, REPOSITORY, Launch, Running, Start, environment, wait_until
+
+STILL = ("--speed", "0.001", "--start-hour", "11")
+"""A simulated noon that does not move while it is looked at."""
+
+ROOT = "1.3.6.1.4.1.32473.1"
+TABLES = {Group.LIVE: 4, Group.ENERGY: 5, Group.TODAY: 6, Group.SETTINGS: 7}
+UNITS = tuple(unit for _, _, _, unit in DEMO_DEVICES)
+MAP = load_map("prostar-mppt")
+
+Values = Mapping[tuple[int, str], float | frozenset[int]]
+"""By unit id and point: a number in the point's unit, or the numbers of the bits that are set."""
+
+
+@pytest.fixture
+def site(launch: Launch) -> Running:
+    """A gateway over the demo's controllers, all of whose points have been read."""
+    running = launch(simulate=STILL)
+    running.wait_online()
+    # Settings are read last of all at start.
+    wait_until(lambda: running.get("/metrics")[1].count("morningstar_absorption_voltage_volts{") == 3, "the settings")
+    return running
+
+
+def snmp(peer: Callable[[str], str], site: Running, program: str, *arguments: str) -> str:
+    """What a program of net-snmp prints; it must have nothing to complain about."""
+    options = ["-v2c", "-c", "public", "-M", "mibs:mibs/base", "-m", "ALL"]
+    command = [peer(program), *options, *arguments[:-1], f"127.0.0.1:{site.snmp}", arguments[-1]]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=REPOSITORY, env=environment(), check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    return done.stdout
+
+
+def by_modbus(site: Running, device_map: DeviceMap) -> Values:
+    """Every point as an unrelated Modbus client reads it."""
+    found: dict[tuple[int, str], float | frozenset[int]] = {}
+    with ModbusTcpClient("127.0.0.1", port=site.modbus, timeout=5, retries=0) as client:
+        for unit in UNITS:
+            for point in device_map.points:
+                if point.metric is None and point.mib is None:
+                    continue
+                if point.space is Space.COILS:
+                    words = [int(client.read_coils(point.address, count=1, device_id=unit).bits[0])]
+                else:
+                    words = client.read_holding_registers(point.address, count=point.words, device_id=unit).registers
+                value = decoded(point, words)
+                if value is not None:
+                    found[unit, point.name] = value
+    return found
+
+
+def decoded(point: Point, words: list[int]) -> float | frozenset[int] | None:
+    """What the words say by the document; None where the document says that they say nothing."""
+    reading = point.readings[0]
+    if reading.codec == "f16" or (reading.codec == "multiplier" and words[0] > 2):  # 1 and 2 are understood too
+        (number,) = struct.unpack(">e", words[0].to_bytes(2))
+        return float(number) * reading.scale if number - number == 0 else None
+    ordered = words if reading.order is WordOrder.HI_LO else words[::-1]
+    raw = int("".join(f"{word:04x}" for word in ordered), 16)
+    if point.bits is not None:
+        return frozenset(bit for bit in range(32) if raw >> bit & 1)
+    if reading.codec == "bcd":
+        return float(int(f"{raw:x}"))
+    if reading.codec.startswith("s"):
+        raw -= (raw >> 15) << 16
+    return raw * reading.scale
+
+
+def by_http(site: Running) -> Values:
+    """Every point as Prometheus reads it."""
+    samples = [
+        sample
+        for family in text_string_to_metric_families(site.get("/metrics")[1])
+        for sample in family.samples
+        if sample.name.startswith("morningstar_")
+    ]
+    found: dict[tuple[int, str], float | frozenset[int]] = {}
+    for point in MAP.points:
+        for unit in UNITS:
+            own = [s for s in samples if s.name == point.metric and s.labels["unit_id"] == str(unit)]
+            if not own:
+                continue
+            if point.enumeration is not None:
+                numbers = {entry.name: entry.number for entry in MAP.enumerations[point.enumeration]}
+                (state,) = (sample.labels["state"] for sample in own if sample.value == 1)
+                found[unit, point.name] = float(numbers[state])
+            elif point.bits is not None:
+                numbers = {bit.name: bit.number for bit in MAP.bit_tables[point.bits]}
+                found[unit, point.name] = frozenset(numbers[s.labels["bit"]] for s in own if s.value == 1)
+            else:
+                (sample,) = own
+                found[unit, point.name] = sample.value / point.metric_scale
+    return found
+
+
+def by_snmp(peer: Callable[[str], str], site: Running) -> Values:
+    """Every point as net-snmp reads it."""
+    shown = snmp(peer, site, "snmpbulkwalk", "-Onqe", "-OU", "-Ox", ROOT)
+    cells = dict(re.findall(r"^\.([\d.]+) (.*?) ?$", shown, re.MULTILINE))
+    found: dict[tuple[int, str], float | frozenset[int]] = {}
+    for point in MAP.points:
+        if point.mib is None:
+            continue
+        for unit in UNITS:
+            cell = cells.get(f"{ROOT}.1.2.1.{TABLES[point.group]}.1.{point.mib.column}.{unit}")
+            if cell is None:
+                continue
+            if point.bits is not None:
+                octets = bytes.fromhex(cell.strip('" '))
+                found[unit, point.name] = frozenset(
+                    bit for bit in range(8 * len(octets)) if octets[bit // 8] & 0x80 >> bit % 8
+                )
+            else:
+                found[unit, point.name] = int(cell) / point.mib.scale
+    return found
+
+
+def differences(one: Values, other: Values) -> list[str]:
+    """Where the second says something else than the first, or nothing; half a thousandth is rounding."""
+    wrong = []
+    for key, value in one.items():
+        there = other.get(key)
+        if isinstance(value, frozenset) or isinstance(there, frozenset) or there is None:
+            same = value == there
+        else:
+            same = abs(value - there) <= 0.00051
+        if not same:
+            wrong.append(f"{key}: {value} is {there}")
+    return wrong
+
+
+@pytest.mark.peer
+def test_the_three_faces_agree_on_every_point(site: Running, peer: Callable[[str], str]) -> None:
+    expected = by_modbus(site, MAP)
+    http, walked = by_http(site), by_snmp(peer, site)
+    assert differences(expected, by_modbus(site, MAP)) == []  # nothing moved meanwhile
+    in_metrics = {key: value for key, value in expected.items() if MAP.point(key[1]).metric is not None}
+    in_mib = {key: value for key, value in expected.items() if MAP.point(key[1]).mib is not None}
+    assert len(in_metrics) > 3 * 80
+    assert len(in_mib) > 3 * 80
+    for values, shown in ((in_metrics, http), (in_mib, walked)):
+        assert differences(values, shown) == []
+        assert differences(shown, values) == []
+
+
+@pytest.mark.peer
+def test_net_snmp_shows_every_table(site: Running, peer: Callable[[str], str]) -> None:
+    mib = (REPOSITORY / "mibs" / "PROSTAR-GATEWAY-MIB.txt").read_text()
+    names = re.findall(r"^(pgw\w+Table) OBJECT-TYPE", mib, re.MULTILINE)
+    assert len(names) >= 6
+    for name in names:
+        shown = snmp(peer, site, "snmptable", "-Ci", name).splitlines()
+        rows = 2 if name == "pgwLineTable" else 3
+        assert shown[0] == f"SNMP table: PROSTAR-GATEWAY-MIB::{name}"
+        assert len([row for row in shown[3:] if row.strip()]) == rows, name
+        assert "array" not in name or "array-1" in "\n".join(shown)
+        walked = snmp(peer, site, "snmpwalk", name).splitlines()
+        assert all(line.startswith("PROSTAR-GATEWAY-MIB::pgw") for line in walked)
+        assert len(walked) >= 2 * rows
+    devices = snmp(peer, site, "snmptable", "-Ci", "-Cf", "|", "pgwDeviceTable")
+    assert all(name in devices for _, name, _, _ in DEMO_DEVICES)
+
+
+@pytest.mark.peer
+def test_promtool_and_a_real_prometheus_have_nothing_to_complain_about(
+    site: Running, peer: Callable[[str], str], start: Start, tmp_path: Path, free_tcp_port: Callable[[], int]
+) -> None:
+    scrape = site.get("/metrics")[1]
+    checked = subprocess.run(
+        [peer("promtool"), "check", "metrics"], input=scrape, check=False, capture_output=True, text=True
+    )
+    assert (checked.returncode, checked.stdout, checked.stderr) == (0, "", "")
+    config = tmp_path / "prometheus.yml"
+    target = f"127.0.0.1:{site.http}"
+    config.write_text(
+        "scrape_configs:\n- job_name: gateway\n  scrape_interval: 200ms\n  scrape_timeout: 200ms\n"
+        f"  static_configs:\n  - targets: ['{target}']\n"
+    )
+    web = f"127.0.0.1:{free_tcp_port()}"
+    arguments = [f"--config.file={config}", f"--storage.tsdb.path={tmp_path / 'tsdb'}", f"--web.listen-address={web}"]
+    prometheus = start(peer("prometheus"), *arguments, "--log.level=debug")
+
+    def query(text: str) -> list[Mapping[str, object]]:
+        try:
+            with urllib.request.urlopen(f"http://{web}/api/v1/query?query={text}", timeout=5) as reply:
+                answer = json.load(reply)
+        except OSError:
+            return []
+        result: list[Mapping[str, object]] = answer["data"]["result"]
+        return result
+
+    wait_until(lambda: query("count_over_time(up[1m])>3"), "four scrapes")
+    assert [float(entry["value"][1]) for entry in query("up")] == [1.0]  # type: ignore[index]
+    assert len(query("morningstar_battery_voltage_volts")) == 3
+    assert len(query("morningstar_charge_state==1")) == 3
+    assert len(query("scrape_samples_scraped>100")) == 1
+    assert prometheus.end() == 0
+    complaints = [line for line in prometheus.log().splitlines() if re.search(r"level=(warn|error)", line)]
+    assert [line for line in complaints if "Received SIGTERM" not in line] == []
