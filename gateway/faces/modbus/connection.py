@@ -109,13 +109,14 @@ class Connection(asyncio.Protocol):
                 if len(data) == READ_SIZE:
                     entry = self._find(data[2:])
                     if entry is not None:
+                        valid_until, device, snapshot, reply = entry
                         now = self._now()
-                        if now < entry[0] and entry[1].snapshot is entry[2]:
+                        if now < valid_until and device.snapshot is snapshot:
                             self.seen = now
                             stats = self._stats
                             stats.requests += 1
                             stats.cache_hits += 1
-                            self._write(data[:2] + entry[3])
+                            self._write(data[:2] + reply)
                             return
                 else:
                     data = self._answer_hot(data)
