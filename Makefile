@@ -56,7 +56,7 @@ format: $(VENV)/.dev ## Format the code and repair what ruff can repair.
 	@$(BIN)/ruff format .
 
 .PHONY: bench
-bench: $(VENV)/.dev ## Measure against the peers and print a table of ratios.
+bench: setup ## Measure against the peers and print a table of ratios.
 	@for bench in tests/bench/bench_*.py; do $(BIN)/python "$$bench"; done
 
 .PHONY: setup

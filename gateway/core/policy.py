@@ -71,6 +71,6 @@ class Audit:
         if left_out is None:
             return None
         return (
-            f"write_refused peer={peer} unit={unit} function=0x{pdu[0]:02x} address={address}"
+            f"event=write_refused peer={peer} unit={unit} function=0x{pdu[0]:02x} address={address}"
             f" reason={decision.reason} left_out={left_out}"
         )

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from itertools import pairwise
 
 from gateway.devices.codecs import CODECS
+from gateway.devices.log import HOURMETER
 from gateway.devices.model import Access, DeviceMap, Extent, Group, LogLayout, Point, PollClass, Space
 from gateway.devices.units import UNITS, metric_name
 
@@ -208,6 +209,8 @@ def _log(device_map: DeviceMap) -> Iterator[str]:
     if extent is None or extent.poll is not PollClass.BACKGROUND:
         yield f"log: 0x{layout.first:04X}..0x{last:04X} needs an extent of poll class background"
     yield from _doubles([field.name for field in layout.fields], "log: field")
+    if not any(field.name == HOURMETER and field.words == 2 for field in layout.fields):
+        yield f"log: needs a field {HOURMETER} of 2 words to be put in order by"
     yield from (f"log: {problem}" for problem in _log_fields(device_map, layout))
 
 

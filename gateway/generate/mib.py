@@ -1,8 +1,8 @@
 """The MIB modules and their lock, from `faces/snmp/layout.py` (docs/adr/0001).
 
 Rules: SMIv2 by RFC 4181 - one prefix, every object in a group, every group in the compliance. Nothing is ever
-renumbered, renamed or retyped: `mibs/oids.lock` lists what was once published, one `OID name syntax` a line, and
-`mib_outputs` refuses to write a MIB that lacks or changes a line of it.
+renumbered, renamed or retyped, nor shown in other units: `mibs/oids.lock` lists what was once published, one
+`OID name syntax units` a line, and `mib_outputs` refuses to write a MIB that lacks or changes a line of it.
 """
 
 from __future__ import annotations
@@ -54,6 +54,10 @@ pgwObjects     OBJECT IDENTIFIER ::= { pgwMIB 1 }
 pgwConformance OBJECT IDENTIFIER ::= { pgwMIB 2 }
 """
 
+_LOCK_HEAD = """\
+# OID, name, syntax and units of everything ever published; lines are only added, by `prostar-gateway generate`.
+"""
+
 _REPOSITORY = Path(__file__).parents[2]
 
 
@@ -99,21 +103,24 @@ def lock(described: Layout, published: str) -> str:
     if problems:
         raise MapError("\n".join(problems))
     added = [line for line in current.values() if line not in set(kept)]
-    head = "# OID name syntax of everything ever published; lines are only added, by `prostar-gateway generate`.\n"
-    return head + "".join(line + "\n" for line in (*kept, *added))
+    return _LOCK_HEAD + "".join(line + "\n" for line in (*kept, *added))
 
 
 def _lock_lines(described: Layout) -> Iterator[str]:
     for group in described.groups:
         for each in group.objects:
-            yield f"{_dotted((*group.base, each.number, 0))} {each.name} {_syntax(each)}"
+            yield _lock_line((*group.base, each.number, 0), each)
     for table in described.tables:
         for each in table.columns:
-            yield f"{_dotted((*table.base, 1, each.number))} {each.name} {_syntax(each)}"
+            yield _lock_line((*table.base, 1, each.number), each)
     for convention in described.conventions:
         for number, name in convention.labels:
             # Labels have no OID; the convention's name and the number stand where one would.
             yield f"{convention.name}.{number} {convention.name}.{name} {convention.syntax}"
+
+
+def _lock_line(oid: Oid, each: ObjectType) -> str:
+    return f"{_dotted(oid)} {each.name} {_syntax(each)} {each.units}".rstrip()
 
 
 def _dotted(oid: Oid) -> str:

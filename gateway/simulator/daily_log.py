@@ -81,7 +81,7 @@ def past_totals(plant: Plant) -> Totals:
         load_ah_r=used * 0.28,
         charge_kwh=energy,
         charge_kwh_r=energy * 0.28,
-        hours=24.0 * plant.age_days,
+        hours_before=24.0 * plant.age_days,
     )
 
 

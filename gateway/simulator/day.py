@@ -51,7 +51,7 @@ class Totals:
     load_ah_r: float = 0.0
     charge_kwh: float = 0.0
     charge_kwh_r: float = 0.0
-    hours: float = 0.0
+    hours_before: float = 0.0  # hourmeter at the midnight the unit's time begins with
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +141,11 @@ class SolarDay:
         self.now.battery_v = self.now.battery_25s_v = self.now.battery_60s_v = rest_v
         self.now.ambient_c = self.now.heatsink_c = self.now.inductor_c = self.sky.ambient_c(0.0)
         self.advance(self.start_s)
+
+    @property
+    def hours(self) -> float:
+        """The hourmeter."""
+        return self.totals.hours_before + self.at_s / 3600
 
     @property
     def battery_c(self) -> float:
@@ -286,7 +291,6 @@ class SolarDay:
         energy = now.output_w * hours / 1000
         totals.charge_kwh += energy
         totals.charge_kwh_r += energy
-        totals.hours += hours
         today.battery_min_v = min(today.battery_min_v, now.battery_v)
         today.battery_max_v = max(today.battery_max_v, now.battery_v)
         today.array_max_v = max(today.array_max_v, now.array_v)
@@ -311,5 +315,5 @@ class SolarDay:
             orders=self.orders,
         )
         if self.charger.dusks != dusks:
-            self.closed.append((self.totals.hours, self.today))
+            self.closed.append((self.hours, self.today))
             self.today = Today()

@@ -19,6 +19,7 @@ from gateway.simulator.memory import Memory
 from gateway.simulator.panel import Labels, publish, store_totals
 from gateway.simulator.plant import PLANTS, Plant
 from gateway.simulator.server import Controller, missing
+from gateway.simulator.sky import DAY_S
 
 DEFAULT_TURNAROUND_S = 0.015
 
@@ -60,6 +61,7 @@ class SimulatedController(Controller):
                 Space.REGISTERS, device_map.identity.serial_first, *_ascii_words(device_map, serial_number)
             )
         self._born: float | None = None
+        self._outdated = True
         self._deaf_until = -math.inf
         restore_factory_settings(self._memory, self.plant)
         self._memory.set("modbus_id", address)
@@ -74,7 +76,6 @@ class SimulatedController(Controller):
             step_s=step_s,
             totals=past_totals(self.plant),
         )
-        self._stored_at_day = self._hourmeter_day()
         self._commands = Commands(self._memory, self.day, self._labels, firmware)
         self._commands.boot()
         self._publish()
@@ -82,7 +83,8 @@ class SimulatedController(Controller):
 
     @property
     def memory(self) -> Memory:
-        """What the registers hold, as of the last request."""
+        """What the registers hold at the time the unit last lived to."""
+        self._refresh()
         return self._memory
 
     def hears(self, now: float) -> bool:
@@ -98,22 +100,22 @@ class SimulatedController(Controller):
         """Let the unit live until `now`; every request does this by itself."""
         if self._born is None:
             self._born = now - self.day.at_s / self._speed
-        changed = False
         if now > self._commands.slave_deadline:
-            self.day.advance((self._commands.slave_deadline - self._born) * self._speed)
+            self._live_until((self._commands.slave_deadline - self._born) * self._speed)
             self._commands.slave_timed_out()
-            changed = True
-        if self.day.advance((now - self._born) * self._speed) or changed:
-            self._publish()
+            self._outdated = True
+        self._live_until((now - self._born) * self._speed)
 
     def read(self, space: Space, first: int, count: int, now: float) -> list[int]:
         """See `Controller.read`."""
         self.advance(now)
+        self._refresh()
         return self._memory.read(space, first, count)
 
     def write(self, space: Space, address: int, value: int, now: float) -> bool:
         """See `Controller.write`."""
         self.advance(now)
+        self._refresh()
         point = self._memory.point_at(space, address)
         if point is None or not accepts_writes(point):
             raise missing(space, address)
@@ -155,19 +157,27 @@ class SimulatedController(Controller):
         daily_log.fill_past(self.plant, random.Random(f"{self._seed}/log"))  # noqa: S311  the past is no secret
         return daily_log
 
-    def _hourmeter_day(self) -> int:
-        return int(self.day.totals.hours // 24)
+    def _live_until(self, at_s: float) -> None:
+        """Move the day, and store the totals at each midnight on the way."""
+        for number in range(int(self.day.at_s // DAY_S) + 1, int(at_s // DAY_S) + 1):
+            self.day.advance(number * DAY_S)
+            self._publish()
+            store_totals(self._memory)
+        self._outdated |= self.day.advance(at_s)
+
+    def _refresh(self) -> None:
+        """Bring the registers up to date; writing all of them costs more than a step of the day, so only when asked."""
+        if self._outdated:
+            self._publish()
 
     def _publish(self) -> None:
+        self._outdated = False
         self.day.show_faults()
         publish(self.day, self._memory, self._labels)
         if self._log is not None:
             for hours, today in self.day.closed:
                 self._log.append(fields_of(hours, today))
         self.day.closed.clear()
-        if self._hourmeter_day() != self._stored_at_day:
-            self._stored_at_day = self._hourmeter_day()
-            store_totals(self._memory)
 
 
 def _serial_extent(device_map: DeviceMap, serial_number: str | None) -> tuple[Extent, ...]:

@@ -136,7 +136,7 @@ def _counted(day: SolarDay) -> dict[str, Value]:
         "charge_energy_total": _wrapped(totals.charge_kwh),
         "load_charge_resettable": totals.load_ah_r,
         "load_charge_total": totals.load_ah,
-        "hourmeter": int(totals.hours),
+        "hourmeter": int(day.hours),
         "battery_voltage_minimum_today": min(today.battery_min_v, day.now.battery_v),
         "battery_voltage_maximum_today": max(today.battery_max_v, day.now.battery_v),
         "charge_today": today.charge_ah,

@@ -27,7 +27,7 @@ class Sky:
         self._warmth_c = warmth_c
         self._day = -1
         self._cloudiness = _FIRST_DAY_CLOUDINESS
-        self._offset_c = 0.0
+        self._offset_c = self._next_offset_c = 0.0
         self._knot = -1
         self._here = self._next = 1.0
 
@@ -46,14 +46,15 @@ class Sky:
     def ambient_c(self, at_s: float) -> float:
         """Air temperature in the shelter."""
         self._select_day(int(at_s // DAY_S))
-        return self._warmth_c + self._offset_c + 7.0 * math.cos(2 * math.pi * (at_s % DAY_S - _WARMEST_S) / DAY_S)
+        part = at_s / DAY_S - self._day
+        daily = 7.0 * math.cos(2 * math.pi * (at_s % DAY_S - _WARMEST_S) / DAY_S)
+        return self._warmth_c + self._offset_c + (self._next_offset_c - self._offset_c) * part + daily
 
     def _select_day(self, day: int) -> None:
         if day != self._day:
             self._day = day
-            dice = self._dice(day, "day")
-            self._cloudiness = _FIRST_DAY_CLOUDINESS if day == 0 else dice.choice(_CLOUDINESS)
-            self._offset_c = dice.uniform(-3.0, 3.0)
+            self._cloudiness = _FIRST_DAY_CLOUDINESS if day == 0 else self._dice(day, "clouds").choice(_CLOUDINESS)
+            self._offset_c, self._next_offset_c = (self._dice(d, "warmth").uniform(-3.0, 3.0) for d in (day, day + 1))
 
     def _clearness(self, knot: int) -> float:
         self._select_day(int(knot * _KNOT_S // DAY_S))

@@ -42,7 +42,7 @@ def test_the_audit_line_names_the_address_and_not_the_value(pdu: str, address: s
     data = bytes.fromhex(pdu)
     line = Audit(Counter()).record(REFUSED_WRITE, "192.0.2.1", 11, data, 0.0)
     assert line == (
-        f"write_refused peer=192.0.2.1 unit=11 function=0x{data[0]:02x} address={address}"
+        f"event=write_refused peer=192.0.2.1 unit=11 function=0x{data[0]:02x} address={address}"
         " reason=writes_disabled left_out=0"
     )
 

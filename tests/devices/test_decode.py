@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gateway.devices.decode import Decoder
 from gateway.devices.model import DeviceMap, Space
-from gateway.devices.schema import load_map
+from gateway.devices.schema import load_map, parse_map
 from gateway.errors import MapError
 
 BLOCK = struct.pack(">8H", 0x4AA0, 0, 0x0001, 0x0002, 1, 0x8001, 0x4D00, 0)
@@ -39,6 +39,13 @@ def test_never_decodes_half_a_pair(small: DeviceMap, first: int, count: int) -> 
 def test_takes_the_reading_chosen_for_the_device(small: DeviceMap) -> None:
     values = Decoder(small, {"energy_total": "swapped"}).decode(Space.REGISTERS, 0, BLOCK)
     assert values["energy_total"] == 13107.3
+
+
+def test_a_broken_digit_in_a_swapped_pair_is_no_value(small_text: str) -> None:
+    swapped_bcd = small_text.replace('codec = "u32"\norder = "lo-hi"', 'codec = "bcd"\norder = "lo-hi"')
+    decoder = Decoder(parse_map(swapped_bcd, "small.toml"), {"energy_total": "swapped"})
+    assert decoder.decode(Space.REGISTERS, 2, b"\x56\x78\x12\x34") == {"energy_total": 1_234_567.8}
+    assert decoder.decode(Space.REGISTERS, 2, b"\x56\x78\x12\x3a") == {}
 
 
 def test_unknown_readings_are_all_named(small: DeviceMap) -> None:

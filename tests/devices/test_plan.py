@@ -97,6 +97,10 @@ def test_unequal_where_the_extent_ends() -> None:
     assert [(block.first, block.count) for block in blocks] == [(0, 100), (149, 101)]
 
 
+def test_equal_where_there_is_no_room() -> None:
+    assert [block.count for block in poll_plan(_wide(249, list(range(250))))] == [125, 125]
+
+
 @pytest.mark.parametrize("model", models())
 def test_splitting_to_the_end_reads_every_item_once_and_tears_no_pair(model: str) -> None:
     device_map = load_map(model)

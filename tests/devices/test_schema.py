@@ -147,6 +147,24 @@ def test_wrong_form_names_the_entry(changed: Change, old: str, new: str, entry: 
         ([("blocks = 16\n", "blocks = 17\n")], "log: 0x8000..0x810F needs an extent of poll class background"),
         ([("offset = 2", "offset = 1")], "log: field voltage: overlaps field hourmeter at offset 1"),
         ([("offset = 2", "offset = 16")], "log: field voltage: ends after the block"),
+        (
+            [('offset = 2\ncodec = "f16"', 'offset = 2\ncodec = "u32"')],
+            "log: field voltage: codec u32 does not fit 1 word",
+        ),
+        ([('offset = 2\ncodec = "f16"', 'offset = 2\ncodec = "coil"')], "log: field voltage: codec coil does not fit"),
+        (
+            [('codec = "f16"\nunit = "V"\nhelp = "Voltage."', 'codec = "f16"\nunit = "mV"\nhelp = "V."')],
+            "log: field voltage: unknown unit 'mV'",
+        ),
+        (
+            [('help = "Voltage."', 'help = "Voltage."\nbits = "alarms"')],
+            "log: field voltage: unknown bit table 'alarms'",
+        ),
+        ([('name = "hourmeter"', 'name = "hours"')], "log: needs a field hourmeter of 2 words"),
+        (
+            [('help = "Reset."', 'help = "Reset."\nmib = { column = 2, syntax = "Unsigned32" }')],
+            "point reset: mib: group command has no table",
+        ),
         ([('offset = 2\ncodec = "f16"', 'offset = 2\ncodec = "f17"')], "log: field voltage: unknown codec 'f17'"),
         (
             [

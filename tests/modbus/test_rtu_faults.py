@@ -154,6 +154,15 @@ def test_f05_replies_of_other_units_do_not_prolong_the_wait(line: VirtualLine) -
     assert line.counters.wrong_unit == 4
 
 
+@pytest.mark.parametrize(
+    "pdu", [b"\x11\x02\xab\xff", b"\x10\x00\x01\x00\x02", b"\xab\x01", b"\x2b\x0e\x01\x01\x00\x00\x00"]
+)
+def test_f05_whatever_another_unit_says_is_recognised(line: VirtualLine, pdu: bytes) -> None:
+    failed(line.ask(read(0), (TURNAROUND_S, append_crc(b"\x02" + pdu))))
+    assert line.counters.wrong_unit == 1
+    assert line.counters.noise_bytes == line.counters.crc_errors == 0
+
+
 def test_f06_wrong_unit_and_right_frame_in_one_read(line: VirtualLine) -> None:
     answer = replied(line.ask(read(0), (TURNAROUND_S, registers(6, 6, address=2) + RIGHT)))
     assert answer.pdu == RIGHT_PDU
@@ -386,3 +395,37 @@ def test_f09_every_cut_gives_the_same_events(corrupt: Callable[[bytes], bytes], 
     line.ask(read(0), (TURNAROUND_S, corrupt(flip(RIGHT, 5))))
     line.run(line.now + 1)
     assert pdus(line.events) == [RIGHT_PDU, "crc"]
+
+
+def receive_at_once(line: VirtualLine, data: bytes, pieces: int) -> Replied:
+    """Hand over a stream at one moment, in reads of that many bytes."""
+    reads = [data[at : at + pieces] for at in range(0, len(data), pieces)]
+    (event,) = [event for part in reads if (event := line.client.receive(part, line.now)) is not None]
+    return replied(event)
+
+
+@pytest.mark.parametrize("pieces", [1, 7, 10_000])
+def test_f09_of_two_nested_frames_the_one_complete_first_wins_in_every_cut(line: VirtualLine, pieces: int) -> None:
+    refusal = append_crc(b"\x01\x83\x06")
+    outer = registers(0x0000, *(int.from_bytes((refusal + b"\x00")[at : at + 2], "big") for at in (0, 2, 4)), 0, 0, 0)
+    line.send(read(0, 7))
+    assert receive_at_once(line, outer, pieces).pdu == b"\x83\x06"
+
+
+@pytest.mark.parametrize("pieces", [1, 7, 10_000])
+def test_f07_a_long_frame_of_another_unit_across_the_edge_of_a_full_buffer(line: VirtualLine, pieces: int) -> None:
+    other = registers(*range(100), address=2)
+    line.send(read(0))
+    assert receive_at_once(line, bytes(400) + other + bytes(100) + RIGHT, pieces).pdu == RIGHT_PDU
+    assert line.counters.wrong_unit == 1
+    assert line.counters.noise_bytes == 500
+
+
+@pytest.mark.parametrize("pieces", [1, 7, 10_000])
+def test_f14_echo_and_reply_on_either_side_of_a_full_buffer(line: VirtualLine, pieces: int) -> None:
+    pdu = WRITES["06"]
+    frame = append_crc(b"\x01" + pdu)
+    line.send(pdu)
+    assert receive_at_once(line, bytes(400) + frame + bytes(200) + frame, pieces).pdu == pdu
+    assert line.counters.echoes == 1
+    assert line.counters.noise_bytes == 600

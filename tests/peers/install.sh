@@ -26,6 +26,7 @@ peers=(
   "iproute2 ip"
   "gcc cc"
   "libc6-dev /usr/include/stdio.h"
+  "pkg-config pkg-config"
   "libmodbus-dev /usr/include/modbus/modbus.h"
 )
 policy=/usr/sbin/policy-rc.d

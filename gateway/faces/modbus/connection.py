@@ -123,7 +123,7 @@ class Connection(asyncio.Protocol):
                 self._input += data
                 self._work()
         except Exception:
-            logger.exception("connection_failed peer=%s", self.peer)
+            logger.exception("event=connection_failed peer=%s", self.peer)
             self._broken()
 
     def eof_received(self) -> bool:
@@ -175,7 +175,7 @@ class Connection(asyncio.Protocol):
             return "unanswered"
         if self._unsent_since is not None and now - self._unsent_since > settings.write_timeout_s:
             return "not_reading"
-        if self._partial_since is not None and now - self._partial_since > settings.frame_timeout_s:
+        if self._reading and self._partial_since is not None and now - self._partial_since > settings.frame_timeout_s:
             return "slow_frame"
         if self.idle and now - self.seen > settings.idle_timeout_s:
             return "idle"
@@ -342,6 +342,8 @@ class Connection(asyncio.Protocol):
             return
         self._reading = on
         if on:
+            if self._partial_since is not None:
+                self._partial_since = self._now()  # it was our turn until now
             self._transport.resume_reading()
         else:
             self._transport.pause_reading()
@@ -351,7 +353,7 @@ class Connection(asyncio.Protocol):
         try:
             step()
         except Exception:
-            logger.exception("connection_failed peer=%s", self.peer)
+            logger.exception("event=connection_failed peer=%s", self.peer)
             self._broken()
 
     def _broken(self) -> None:

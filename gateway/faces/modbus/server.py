@@ -63,7 +63,6 @@ class Listener:
         except OSError as error:
             raise ListenError(f"{self.label}: {bind_problem(error)}") from error
         self._server.started(self)
-        logger.info("listening face=modbus address=%s port=%d", *(self.bound or (self._host, self._port)))
 
     async def stop(self) -> None:
         """Take no more connections, let the open ones finish (rule 4)."""
@@ -151,7 +150,7 @@ class ModbusServer:
         for connection in tuple(self._connections):
             reason = connection.overdue(now)
             if reason is not None:
-                logger.info("connection_ended peer=%s reason=%s", connection.peer, reason)
+                logger.info("event=connection_ended peer=%s reason=%s", connection.peer, reason)
                 connection.end(reason)
 
     def _sweep_again(self) -> None:
@@ -172,5 +171,5 @@ class ModbusServer:
         self._stats.closed[reason] += 1
         left_out = self._refusals_told.spend((reason, peer), self._now())
         if left_out is not None:
-            logger.warning("connection_refused peer=%s reason=%s left_out=%d", peer, reason, left_out)
+            logger.warning("event=connection_refused peer=%s reason=%s left_out=%d", peer, reason, left_out)
         return False

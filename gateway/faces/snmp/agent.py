@@ -22,14 +22,11 @@ from gateway.faces.snmp.counters import SnmpCounters
 from gateway.faces.snmp.layout import Layout, shipped_layout
 from gateway.faces.snmp.objects import Gateway
 from gateway.faces.snmp.responder import Refused, Responder
-from gateway.faces.snmp.settings import DOCUMENTATION_ENTERPRISE, SnmpSettings
+from gateway.faces.snmp.settings import SnmpSettings
 from gateway.faces.snmp.throttle import Throttle
 from gateway.faces.snmp.tree import Tree, whole
 
 _log = logging.getLogger(__name__)
-
-_ENTERPRISE_ARC = 6
-"""Position of the enterprise number in 1.3.6.1.4.1.n."""
 
 
 class SnmpAgent:
@@ -61,11 +58,6 @@ class SnmpAgent:
         self._throttle = Throttle()
         self.listeners = tuple(SnmpListener(self, host, port) for host, port in settings.listen)
         self._warm_up()
-        if settings.enterprise_root[_ENTERPRISE_ARC : _ENTERPRISE_ARC + 1] == (DOCUMENTATION_ENTERPRISE,):
-            _log.warning(
-                "snmp_enterprise_root number=%d reason=for_documentation_only hint=set_snmp.enterprise_root",
-                DOCUMENTATION_ENTERPRISE,
-            )
 
     def answer(self, data: bytes, host: str) -> bytes | None:
         """The reply to a datagram from `host`, or None; never raises."""
@@ -153,7 +145,6 @@ class SnmpListener:
             if sock is not None:
                 sock.close()
             raise ListenError(f"{self.label} (UDP): {error.strerror or error}") from error
-        _log.info("snmp_listening address=%s port=%d", *(self.bound or (self._host, self._port)))
 
     async def stop(self) -> None:
         """Close the socket; a listener that is not started stays so."""

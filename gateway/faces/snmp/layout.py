@@ -250,6 +250,7 @@ class _Columns:
             convention=convention,
             changes=Changes.WITH_SNAPSHOT,
             models=frozenset({device_map.model}),
+            point=point.name,
         )
 
     def _convention(self, key: str | None, where: str) -> Convention:

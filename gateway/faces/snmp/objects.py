@@ -130,6 +130,7 @@ class ObjectType:
     convention: Convention | None = None
     changes: Changes = Changes.ALWAYS
     models: frozenset[str] | None = None
+    point: str | None = None  # the map's point; without a shown value of it there is no cell
 
 
 @dataclass(frozen=True, slots=True)

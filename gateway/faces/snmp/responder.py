@@ -142,6 +142,7 @@ class Responder:
         def reply(status: ErrorStatus, index: int, varbinds: bytes) -> bytes:
             return wire.response(community, request.request_id, status.value, index, varbinds)
 
+        self._tree.refresh()
         room = REPLY_LIMIT - len(reply(ErrorStatus.NO_ERROR, 0, b"")) - _LENGTH_GROWTH
         pdu = request.pdu
         status, index = ErrorStatus.NO_ERROR, 0

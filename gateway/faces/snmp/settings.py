@@ -9,7 +9,7 @@ Network = IPv4Network | IPv6Network
 Oid = tuple[int, ...]
 
 DOCUMENTATION_ENTERPRISE = 32473
-"""RFC 5612: for examples only; the agent warns while its MIB hangs there."""
+"""RFC 5612: for examples only; an operator has a number of their own."""
 
 DEFAULT_ROOT: Oid = (1, 3, 6, 1, 4, 1, DOCUMENTATION_ENTERPRISE, 1)
 

@@ -10,6 +10,7 @@ import struct
 import pytest
 
 from gateway.errors import ListenError
+from gateway.faces.modbus.connection import MAX_WAITING
 from gateway.modbus import mbap
 
 from .conftest import Running, Serve, World, registers
@@ -103,6 +104,23 @@ async def test_f30_half_a_request_must_be_completed_in_time(running: Running) ->
     assert await slow.rest() == b""
     assert world.stats.closed == {"slow_frame": 1}
     assert await other.query(12, READ_1)
+
+
+async def test_f30_a_request_that_the_server_itself_left_half_read_is_not_late(running: Running) -> None:
+    world = running.world
+    line = world.line(12)
+    line.held = True
+    client = await running.connect()
+    client.send(GOOD * 200)
+    await running.until(lambda: bool(line.waiting) and len(line.waiting[0].waiters) == MAX_WAITING)
+    connection = next(iter(running.server._connections))
+    assert connection._splitter.pending, "the cut of the first piece went through a request"
+    world.clock.now += 6.0
+    running.server.sweep()
+    line.held = False
+    line.release()
+    assert await client.adus(200) == [mbap.Adu(1, 12, GOOD_REPLY[7:])] * 200
+    assert not world.stats.closed
 
 
 async def test_f31_a_client_that_takes_no_replies_is_paused_then_cut_off(running: Running) -> None:

@@ -157,6 +157,6 @@ async def test_a_refused_write_leaves_one_audit_line_without_its_value(
         assert await client.query(11, bytes.fromhex("06 e012 beef")) == b"\x86\x01"
     lines = [record.getMessage() for record in caplog.records if "write_refused" in record.getMessage()]
     assert lines == [
-        "write_refused peer=127.0.0.1 unit=11 function=0x06 address=0xe012 reason=writes_disabled left_out=0"
+        "event=write_refused peer=127.0.0.1 unit=11 function=0x06 address=0xe012 reason=writes_disabled left_out=0"
     ]
     assert running.world.stats.refused == {"writes_disabled": 3}

@@ -1,0 +1,203 @@
+"""What is wrong around the gateway is said, stays where it is, and is over when its cause is."""
+
+from __future__ import annotations
+
+import random
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import serial
+
+from tests.e2e.programs import (
+    DEMO_DEVICES,
+    GATEWAY,
+    Launch,
+    Running,
+    Start,
+    alive,
+    environment,
+    wait_until,
+    write_config,
+)
+
+READ_RAM = bytes.fromhex("0000000000060103 0012 0005".replace(" ", ""))
+"""An MBAP request for unit 1: five registers from 0x0012; the unit is replaced."""
+
+
+def ask(port: int, unit: int, *, tid: int = 7) -> bytes:
+    """The reply PDU to a read of five live registers."""
+    request = tid.to_bytes(2) + READ_RAM[2:6] + bytes([unit]) + READ_RAM[7:]
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as client, client.makefile("rb") as stream:
+        client.sendall(request)
+        header = stream.read(7)
+        assert header[:2] == tid.to_bytes(2)
+        assert header[6] == unit
+        return stream.read(int.from_bytes(header[4:6]) - 1)
+
+
+def test_a_bad_config_exits_78_with_every_problem(tmp_path: Path) -> None:
+    path = tmp_path / "site.toml"
+    path.write_text('sight = "a"\n[[line]]\nname = "a"\n[poll]\nlive_s = 0\n[modbus]\nwrites = true\n')
+    for command in ("run", "check-config"):
+        done = subprocess.run([*GATEWAY, command, "-c", str(path)], capture_output=True, text=True, check=False)
+        assert done.returncode == 78
+        assert done.stdout == ""
+        *problems, last = done.stderr.splitlines()
+        assert [line.removeprefix(f"{path}: ").split(": ")[0] for line in problems] == [
+            "sight",
+            "line[0].port",
+            "line[0].device",
+            "poll.live_s",
+            "modbus.writes",
+            "site",
+        ]
+        assert last == f"6 problems in {path}"
+
+
+def test_an_absent_port_is_named_the_others_go_on_and_it_is_retried(launch: Launch, start: Start) -> None:
+    site = launch(simulate=["--line", "shelter-b=1"])
+    line = site.gateway.wait_for(r"line_down line=shelter-a")
+    assert str(site.folder / "shelter-a") in line
+    assert "no such device" in line
+    site.wait_online("array-3")
+    assert ask(site.modbus, 13)[0] == 0x03
+    assert ask(site.modbus, 11) == b"\x83\x0a"  # no path: the line is not open
+    assert site.get("/readyz") == (200, "ready\n")  # a missing line is not about readiness
+    start(*GATEWAY, "simulate", "--link-dir", str(site.folder), "--line", "shelter-a=1,2")
+    site.gateway.wait_for(r"line_up line=shelter-a")
+    site.wait_online()
+    assert site.gateway.end() == 0
+
+
+def test_a_busy_port_is_named_with_its_holder(launch: Launch, start: Start, tmp_path: Path) -> None:
+    start(*GATEWAY, "simulate", "--link-dir", str(tmp_path))
+    wait_until((tmp_path / "shelter-a").exists, "the simulated line")
+    with serial.Serial(str(tmp_path / "shelter-a"), exclusive=True):
+        site = launch(simulate=None)
+        assert "in use by" in site.gateway.wait_for(r"line_down line=shelter-a")
+        site.wait_online("array-3")
+    site.wait_online()
+
+
+@pytest.mark.parametrize("face", ["modbus", "snmp", "http"])
+def test_a_taken_port_is_named_the_other_faces_go_on_and_it_is_retried(
+    start: Start, tmp_path: Path, face: str, free_tcp_port: Callable[[], int], free_udp_port: Callable[[], int]
+) -> None:
+    ports = {"modbus": free_tcp_port(), "snmp": free_udp_port(), "http": free_tcp_port()}
+    write_config(tmp_path / "site.toml", (ports["modbus"], ports["snmp"], ports["http"]))
+    kind = socket.SOCK_DGRAM if face == "snmp" else socket.SOCK_STREAM
+    with socket.socket(socket.AF_INET, kind) as holder:
+        holder.bind(("127.0.0.1", ports[face]))
+        if face != "snmp":
+            holder.listen()
+        gateway = start(*GATEWAY, "run", "-c", str(tmp_path / "site.toml"))
+        site = Running(tmp_path, ports["modbus"], ports["snmp"], ports["http"], gateway, None)
+        said = gateway.wait_for("event=listen_failed")
+        assert f'listener="{face} 127.0.0.1:{ports[face]}"' in said
+        if face != "modbus":
+            wait_until(lambda: can_connect(ports["modbus"]), "the Modbus face")
+            assert ask(ports["modbus"], 11) == b"\x83\x0a"
+        if face != "http":
+            wait_until(lambda: site.get("/readyz")[0], "the HTTP face")
+            assert site.get("/readyz") == (503, f"not ready\n{face} 127.0.0.1:{ports[face]} is not open\n")
+            assert site.get("/healthz")[0] == 200
+    gateway.wait_for(rf'event=listening listener="{face} .* after_s=')
+    wait_until(lambda: site.get("/readyz") == (200, "ready\n"), "readiness")
+    assert gateway.log().count("event=listen_failed") + gateway.seen.count("event=listen_failed") <= 1
+    assert gateway.end() == 0
+
+
+def can_connect(port: int) -> bool:
+    """Whether somebody listens."""
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def test_a_silent_device_is_offline_and_the_others_are_served(launch: Launch) -> None:
+    # Nobody has address 9: what is asked of it is never answered.
+    site = launch(devices=(*DEMO_DEVICES, ("shelter-a", "ghost", 9, 19)))
+    site.gateway.wait_for(r"device_offline .*device=ghost")
+    site.wait_online("array-1", "array-2", "array-3")
+    began = time.monotonic()
+    assert ask(site.modbus, 19) == b"\x83\x0b"
+    assert time.monotonic() - began < 0.5  # refused at once, without waiting for the line
+    for unit in (11, 12, 13):
+        assert ask(site.modbus, unit)[0] == 0x03
+    metrics = site.get("/metrics")[1]
+    assert 'morningstar_battery_voltage_volts{device="array-1"' in metrics
+    assert 'morningstar_battery_voltage_volts{device="ghost"' not in metrics
+    assert site.up() == {"array-1": 1, "array-2": 1, "array-3": 1, "ghost": 0}
+
+
+@pytest.mark.peer
+def test_malformed_frames_stop_nothing(launch: Launch, peer: Callable[[str], str]) -> None:
+    site = launch()
+    site.wait_online()
+    # repeatable, so that a failure can be looked at again
+    source = random.Random(20261122)
+    right = (7).to_bytes(2) + READ_RAM[2:6] + bytes([11]) + READ_RAM[7:]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for _ in range(300):
+            noise = source.randbytes(source.randrange(1, 300))
+            sender.sendto(noise, ("127.0.0.1", site.snmp))
+            sender.sendto(b"\x30\x82" + noise, ("127.0.0.1", site.snmp))
+    for _ in range(60):
+        mutated = bytearray(right * source.randrange(1, 4))
+        for _ in range(source.randrange(1, 5)):
+            mutated[source.randrange(len(mutated))] = source.randrange(256)
+        with socket.create_connection(("127.0.0.1", site.modbus), timeout=5) as client:
+            client.sendall(source.choice([bytes(mutated), source.randbytes(source.randrange(1, 300))]))
+            client.shutdown(socket.SHUT_WR)
+    assert ask(site.modbus, 11)[0] == 0x03
+    asked = [peer("snmpget"), "-v2c", "-c", "public", "-Oqv", f"127.0.0.1:{site.snmp}", "1.3.6.1.2.1.1.1.0"]
+    shown = subprocess.run(asked, capture_output=True, text=True, env=environment(), check=False)
+    assert "prostar-gateway" in shown.stdout
+    assert "task_failed" not in site.gateway.log()
+    assert "Traceback" not in site.gateway.log()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_stops_it_with_exit_status_0(launch: Launch, number: signal.Signals) -> None:
+    site = launch()
+    site.wait_online("array-1")
+    with socket.create_connection(("127.0.0.1", site.modbus), timeout=5):  # an idle client is no reason to wait
+        began = time.monotonic()
+        assert site.gateway.end(number) == 0
+        assert time.monotonic() - began < 2.0
+    log = site.gateway.log()
+    assert f"event=stopping signal={number.name}" in log
+    assert log.endswith("event=stopped")
+    assert "Traceback" not in log
+
+
+def test_a_second_signal_does_not_wait(launch: Launch) -> None:
+    site = launch(line_keys="reply_timeout_s = 10.0", devices=(*DEMO_DEVICES, ("shelter-a", "ghost", 9, 19)))
+    site.gateway.wait_for("line_up line=shelter-a")
+    wait_until(lambda: can_connect(site.modbus), "the Modbus face")
+    with socket.create_connection(("127.0.0.1", site.modbus), timeout=5) as client:
+        client.sendall((7).to_bytes(2) + READ_RAM[2:6] + bytes([19]) + READ_RAM[7:])
+        site.gateway.process.send_signal(signal.SIGTERM)
+        site.gateway.wait_for("event=stopping")
+        began = time.monotonic()
+        assert site.gateway.end() == 0
+        assert time.monotonic() - began < 0.5
+
+
+def test_a_signal_while_it_starts_ends_it_quietly(tmp_path: Path) -> None:
+    write_config(tmp_path / "site.toml", (0, 0, 0))
+    for delay_s in (0.15, 0.4):
+        process = subprocess.Popen([*GATEWAY, "run", "-c", str(tmp_path / "site.toml")], stderr=subprocess.PIPE)
+        try:
+            with pytest.raises(subprocess.TimeoutExpired):
+                process.wait(delay_s)
+        finally:
+            process.terminate()
+            _, said = process.communicate(timeout=5)
+        assert process.returncode in {0, -signal.SIGTERM}  # before Python itself is up nobody handles signals
+        assert b"Traceback" not in said
+        assert alive([process.pid]) == []

@@ -1,0 +1,67 @@
+"""Addresses that may connect, and what the kernel is told about a connection."""
+
+from __future__ import annotations
+
+import errno
+import socket
+from ipaddress import ip_network
+
+import pytest
+
+from gateway.faces.modbus.settings import LOOPBACK
+from gateway.faces.modbus.tcp import allowed, bind_problem
+
+from .conftest import Running
+
+
+@pytest.mark.parametrize(
+    ("peer", "inside"),
+    [
+        ("127.0.0.1", True),
+        ("127.255.0.9", True),
+        ("::1", True),
+        ("::ffff:127.0.0.1", True),
+        ("::ffff:192.0.2.1", False),
+        ("192.0.2.1", False),
+        ("fe80::1%eth0", False),
+        ("", False),
+        ("localhost", False),
+    ],
+)
+def test_loopback_by_default(peer: str, inside: bool) -> None:
+    assert allowed(peer, LOOPBACK) is inside
+
+
+def test_an_address_with_a_scope() -> None:
+    assert allowed("fe80::1%eth0", (ip_network("fe80::/10"),))
+
+
+def test_nobody_is_allowed_by_nothing() -> None:
+    assert not allowed("127.0.0.1", ())
+
+
+@pytest.mark.parametrize("number", [errno.EADDRINUSE, errno.EACCES, errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT])
+def test_a_bind_problem_is_told_in_words(number: int) -> None:
+    assert "Errno" not in bind_problem(OSError(number, "x"))
+    assert len(bind_problem(OSError(number, "x"))) > 10
+
+
+def test_another_bind_problem_is_told_as_the_system_does() -> None:
+    assert bind_problem(OSError(errno.EMFILE, "Too many open files")) == "Too many open files"
+
+
+@pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="only Linux has it")
+async def test_f33_a_peer_that_is_gone_is_found_out_within_a_minute(running: Running) -> None:
+    await running.connect()
+    await running.until(lambda: running.world.stats.open_connections == 1)
+    transport = next(iter(running.server._connections))._transport
+    assert transport is not None
+    sock = transport.get_extra_info("socket")
+    assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+    assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+    idle, interval, probes = (
+        sock.getsockopt(socket.IPPROTO_TCP, option)
+        for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
+    )
+    assert idle + interval * probes <= 60
+    assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 20_000

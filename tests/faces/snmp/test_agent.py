@@ -1,0 +1,102 @@
+"""Sockets: what is bound, what is said when it cannot be, and a datagram through a real loop."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Callable
+
+import pytest
+from pysnmp.proto.api import v2c
+
+from gateway.errors import ListenError
+from gateway.faces.snmp.agent import SnmpAgent
+from tests.faces.snmp.stub_site import listening
+from tests.faces.snmp.test_responder import SYS_DESCR, Reply, request
+
+
+async def exchange(address: tuple[str, int], data: bytes) -> bytes:
+    """One datagram there and one back."""
+    loop = asyncio.get_running_loop()
+    family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as asker:
+        asker.setblocking(False)
+        asker.connect(address)
+        await loop.sock_sendall(asker, data)
+        return await asyncio.wait_for(loop.sock_recv(asker, 2000), 5)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "localhost"])
+async def test_a_listener_answers_and_can_be_started_again(make_agent: Callable[..., SnmpAgent], host: str) -> None:
+    agent = make_agent(listen=((host, 0),))
+    for _ in range(2):
+        async with listening(agent) as bound:
+            reply = Reply(await exchange(bound, request(v2c.GetRequestPDU, SYS_DESCR)))
+            assert reply.names == [SYS_DESCR]
+        assert agent.listeners[0].bound is None
+
+
+async def test_start_and_stop_may_be_repeated(make_agent: Callable[..., SnmpAgent]) -> None:
+    listener = make_agent().listeners[0]
+    await listener.stop()
+    await listener.start()
+    first = listener.bound
+    await listener.start()
+    assert listener.bound == first
+    await listener.stop()
+    await listener.stop()
+
+
+def test_labels_name_the_address(make_agent: Callable[..., SnmpAgent]) -> None:
+    agent = make_agent(listen=(("127.0.0.1", 1161), ("::1", 1161)))
+    assert [listener.label for listener in agent.listeners] == ["snmp 127.0.0.1:1161", "snmp [::1]:1161"]
+
+
+async def test_a_taken_port_is_named_and_can_be_tried_again(make_agent: Callable[..., SnmpAgent]) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
+        holder.bind(("127.0.0.1", 0))
+        port = holder.getsockname()[1]
+        agent = make_agent(listen=(("127.0.0.1", port),))
+        with pytest.raises(ListenError, match=rf"snmp 127\.0\.0\.1:{port} \(UDP\): .*in use"):
+            await agent.listeners[0].start()
+        assert agent.listeners[0].bound is None
+    async with listening(agent) as bound:
+        assert bound == ("127.0.0.1", port)
+
+
+async def test_an_address_that_is_not_ours_is_named(make_agent: Callable[..., SnmpAgent]) -> None:
+    agent = make_agent(listen=(("192.0.2.1", 1161),))
+    with pytest.raises(ListenError, match=r"snmp 192\.0\.2\.1:1161"):
+        await agent.listeners[0].start()
+
+
+async def test_both_families_share_a_port(make_agent: Callable[..., SnmpAgent]) -> None:
+    agent = make_agent(listen=(("0.0.0.0", 0),))
+    async with listening(agent) as (_, port):
+        second = make_agent(listen=(("::", port),))
+        async with listening(second):
+            assert Reply(await exchange(("::1", port), request(v2c.GetRequestPDU, SYS_DESCR))).status == 0
+            assert Reply(await exchange(("127.0.0.1", port), request(v2c.GetRequestPDU, SYS_DESCR))).status == 0
+        assert second.counters.responses == agent.counters.responses == 1
+
+
+async def test_hostile_datagrams_do_not_stop_the_server(make_agent: Callable[..., SnmpAgent]) -> None:
+    agent = make_agent()
+    wrong = [b"", b"\x30", b"\x30\x84\xff\xff\xff\xff", b"\x00" * 1472, b"\x30" * 9000, request(v2c.ReportPDU)]
+    async with listening(agent) as bound:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asker:
+            for data in wrong:
+                asker.sendto(data, bound)
+        reply = await exchange(bound, request(v2c.GetRequestPDU, SYS_DESCR))
+    assert Reply(reply).status == 0
+    assert agent.counters.in_packets == len(wrong) + 1
+    assert agent.counters.dropped == len(wrong)
+
+
+async def test_an_asker_that_is_gone_does_not_stop_the_server(make_agent: Callable[..., SnmpAgent]) -> None:
+    agent = make_agent()
+    async with listening(agent) as bound:
+        for _ in range(3):
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
+                gone.sendto(request(v2c.GetRequestPDU, SYS_DESCR), bound)
+        assert Reply(await exchange(bound, request(v2c.GetRequestPDU, SYS_DESCR))).status == 0
