@@ -82,6 +82,12 @@ class QueueTimeout(Busy):
     label = "queue_timeout"
 
 
+class EchoUnknown(Busy):
+    """A write waits until it is known whether the line gives requests back: an echo looks like success."""
+
+    label = "echo_unknown"
+
+
 class ShuttingDown(Busy):
     """The gateway is stopping."""
 
@@ -105,6 +111,12 @@ class LineDown(PathUnavailable):
     """The serial line is not open."""
 
     label = "line_down"
+
+
+class IdentityUnproven(PathUnavailable):
+    """Another controller may be at the other end; nothing is asked of it before it has proved who it is."""
+
+    label = "identity_unproven"
 
 
 class DeviceSilent(RequestError):

@@ -6,10 +6,12 @@ always decoded from one read, and carries the time at which that read's request 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
 from gateway.core.health import Breaker
+from gateway.core.identity import Identity
 from gateway.core.scheduler import PollList
 from gateway.core.site import Device
 from gateway.core.snapshot import Block, DeviceState, Snapshot
@@ -25,7 +27,11 @@ class DeviceRecord:
     def __init__(self, device: Device, polls: PollList, now: float) -> None:
         self.device = device
         self.polls = polls
-        self.learned_serial = False
+        self.known = device.expected
+        self.verified = False  # since the line was opened or the device came back
+        self.restarting_until = 0.0  # a restart was commanded: its silence means nothing
+        self.rewrites: dict[str, float] = {}  # point that must be written again and again → last written
+        self.live_started_at: float | None = None
         self._decoder = Decoder(device.map, device.decode)
         self._parts: dict[PartKey, tuple[Block, dict[str, Value]]] = {}
         device.snapshot = Snapshot(state_since=now)
@@ -40,26 +46,43 @@ class DeviceRecord:
         """The state that the faces see now."""
         return self.device.snapshot.state
 
+    @property
+    def values(self) -> Mapping[str, Value]:
+        """The last values, whatever the state."""
+        return self.device.snapshot.values
+
+    @property
+    def night(self) -> bool:
+        """Whether the device says that it sleeps until morning."""
+        rule = self.device.map.night
+        return rule is not None and self.values.get(rule.point) == rule.value
+
+    def seen(self) -> Identity:
+        """What the unit at the other end tells of itself."""
+        snapshot = self.device.snapshot
+        identification = snapshot.identification
+        growing = self.device.map.identity.growing
+        counters = {rule.point: self.values[rule.point] for rule in growing if rule.point in self.values}
+        return Identity(
+            product=None if identification is None else identification.product,
+            revision=None if identification is None else identification.revision,
+            serial_number=snapshot.serial_number,
+            counters=counters,
+            at=max((snapshot.read_at[point] for point in counters), default=0.0),
+        )
+
     def store(self, block: Block, now: float) -> None:
         """Take in a block that was read by a poll and publish a new snapshot."""
         values = self._decoder.decode(block.space, block.first, block.data)
         self.device.stats.implausible = self._decoder.implausible
         self._parts[(block.space, block.first, block.count)] = (block, values)
-        merged: dict[str, Value] = {}
-        read_at: dict[str, float] = {}
-        for part, part_values in self._parts.values():
-            merged.update(part_values)
-            read_at.update(dict.fromkeys(part_values, part.read_at))
-        self._publish(
-            last_reply_at=now,
-            blocks=tuple(part for part, _ in self._parts.values()),
-            values=MappingProxyType(merged),
-            read_at=MappingProxyType(read_at),
-        )
+        self._merge(last_reply_at=now)
 
-    def drop(self, key: PartKey) -> None:
-        """Forget a block that is no longer read as one (it was split)."""
-        self._parts.pop(key, None)
+    def forget(self, space: Space, first: int, end: int) -> None:
+        """Drop what was read of these addresses: it was written, or is no longer read as one block."""
+        for key in [k for k in self._parts if k[0] is space and k[1] < end and first < k[1] + k[2]]:
+            del self._parts[key]
+        self._merge()
 
     def heard(self, now: float) -> None:
         """The device answered something that is not a poll's block."""
@@ -71,13 +94,42 @@ class DeviceRecord:
 
     def numbered(self, serial_number: str, now: float) -> None:
         """The serial number was read."""
-        self._publish(last_reply_at=now, serial_number=serial_number)
+        self._publish(last_reply_at=now, serial_number=serial_number or None)
+
+    def restart(self) -> None:
+        """Another unit may stand there now: nothing of the old one is kept but what is known of its identity."""
+        self.verified = False
+        self.live_started_at = None
+        self._parts.clear()
+        self._publish(identification=None, serial_number=None)
+
+    def warn(self, warning: str, *, on: bool) -> bool:
+        """Raise or clear a condition that the gateway sees; tells whether that changed anything."""
+        warnings = self.device.snapshot.warnings
+        changed = (warnings | {warning}) if on else (warnings - {warning})
+        if changed == warnings:
+            return False
+        self._publish(warnings=changed)
+        return True
 
     def become(self, state: DeviceState, now: float) -> float:
         """Publish a new state; gives the seconds that the old one lasted."""
         lasted_s = now - self.device.snapshot.state_since
         self._publish(state=state, state_since=now)
         return lasted_s
+
+    def _merge(self, **changes: object) -> None:
+        merged: dict[str, Value] = {}
+        read_at: dict[str, float] = {}
+        for part, values in self._parts.values():
+            merged.update(values)
+            read_at.update(dict.fromkeys(values, part.read_at))
+        self._publish(
+            blocks=tuple(part for part, _ in self._parts.values()),
+            values=MappingProxyType(merged),
+            read_at=MappingProxyType(read_at),
+            **changes,
+        )
 
     def _publish(self, **changes: object) -> None:
         old = self.device.snapshot

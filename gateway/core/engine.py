@@ -2,14 +2,16 @@
 
 Rule 1: one transaction at a time; the next request goes out only when the RTU client says so (gap kept,
         quarantine over) and the scheduler says whose turn it is.
-Rule 2: a device is online once each of its live blocks was read since the line was opened or the device
-        came back, and while none was missed three times in a row; stale when one was, or when the line is
-        down; offline from the moment its breaker opens until it is online again.
-Rule 3: a client's read is tried `retries` times more, a poll waits for its next turn instead.
-Rule 4: a poll refused with exception 02 or 03 is split in two and the split is remembered.
-Rule 5: nothing but functions 01 to 04 and 2B/0E is ever sent.
+Rule 2: a client's read is tried `retries` times more, a poll waits for its next turn instead, a write is never
+        repeated: when its answer is missing, nobody knows, and the old value is forgotten.
+Rule 3: an exception to reads that were joined is nobody's answer: they are made again, apart.
+Rule 4: a write goes out only where the settings allow writes and once it is known whether the line echoes, for an
+        echo is byte for byte the answer to a write that succeeded.
+Rule 5: a device that was told to restart does not answer: that silence is success, and the silence of the
+        seconds after it is no failure.
+Rule 6: nothing is asked for a client of a unit that has not proved to be the expected one (polling.py).
 
-The shell calls `opened`, `closed`, `receive`, `on_timer` and `submit`, then `step` until it returns None,
+The shell calls `opened`, `closed`, `receive`, `on_timer`, `read` and `write`, then `step` until it returns None,
 writing what it returns, and comes back at `next_deadline`. Outcomes are handed out by `step` only.
 """
 
@@ -17,110 +19,149 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from random import Random
 
+from gateway.core.accounting import Accounting
+from gateway.core.budget import read_s
+from gateway.core.coalescing import part
 from gateway.core.device_record import DeviceRecord
-from gateway.core.health import MISSES_TO_OPEN, Breaker
-from gateway.core.scheduler import ClientRead, Job, PollItem, PollList, Purpose, Scheduler, Waiter
+from gateway.core.health import Breaker
+from gateway.core.polling import IDENTITY_MISMATCH, Polling
+from gateway.core.requests import ClientRead, Lane, PollItem, ReadTurn, Span, Turn, Waiter, WriteTurn
+from gateway.core.scheduler import PollList, Scheduler
 from gateway.core.settings import LineSettings
 from gateway.core.site import Device, LineState, LineStatus, Outcome
-from gateway.core.snapshot import Block, DeviceState
+from gateway.core.snapshot import DeviceState
 from gateway.core.stats import LineStats
-from gateway.core.usage import UseMeter
-from gateway.devices.model import Identification, PollClass, Space
-from gateway.devices.plan import PlannedBlock, poll_plan, split
-from gateway.errors import DeviceOffline, IllegalFunction, LineDown, QueueTimeout, ReplyTimeout, RequestError
-from gateway.modbus.pdu import (
-    Function,
-    ReadRequest,
-    is_exception,
-    parse_identification,
-    read_identification_request,
+from gateway.devices.model import Point
+from gateway.errors import (
+    DeviceOffline,
+    EchoUnknown,
+    IdentityUnproven,
+    IllegalFunction,
+    LineDown,
+    QueueFull,
+    QueueTimeout,
+    ReplyTimeout,
+    RequestError,
 )
+from gateway.modbus.collector import Echo
+from gateway.modbus.pdu import Function, is_exception, parse_read
 from gateway.modbus.rtu import Failed, Replied, RtuClient, State
 
 log = logging.getLogger(__name__)
 
-READ_FUNCTIONS = frozenset(
+RESTART_S = 15.0
+"""How long a device that was told to restart may be silent."""
+
+_READS = frozenset(
     {
         Function.READ_COILS,
         Function.READ_DISCRETE_INPUTS,
         Function.READ_HOLDING_REGISTERS,
         Function.READ_INPUT_REGISTERS,
-        Function.READ_IDENTIFICATION,
     }
 )
-_REFUSALS_TO_SPLIT = (0x02, 0x03)
+_WRITES = frozenset({Function.WRITE_SINGLE_COIL, Function.WRITE_SINGLE_REGISTER})
+_REFUSALS = (0x02, 0x03)
 
 
 class LineEngine:
-    """Polls and client reads of one line."""
+    """Polls, client reads and writes of one line."""
 
     def __init__(self, settings: LineSettings, devices: Sequence[Device], now: float, rng: Random) -> None:
         self.settings = settings
         self.stats = LineStats()
-        self._rtu = RtuClient(settings.timing(), self.stats.wire, quarantine_s=settings.quarantine_s)
+        timing = settings.timing()
+        self._rtu = RtuClient(timing, self.stats.wire, quarantine_s=settings.quarantine_s)
+        self._polling = Polling(settings)
         self._records = {
-            device.unit_id: DeviceRecord(device, PollList(device, Breaker(rng), self._first_polls(device, now)), now)
+            device.unit_id: DeviceRecord(device, PollList(device, Breaker(rng), self._polling.first(device, now)), now)
             for device in devices
         }
         self._scheduler = Scheduler(
             [record.polls for record in self._records.values()],
             limit=settings.queue_limit,
             limit_s=settings.queue_limit_s,
+            cost=lambda space, count: read_s(timing, space, count),
+            now=now,
         )
-        self._job: Job | None = None
+        self._accounting = Accounting(self.stats, now)
+        self._turn: Turn | None = None
         self._sent_at = now
         self._finished: deque[tuple[Waiter, Outcome]] = deque()
         self._state = LineState.DOWN
         self._state_since = now
         self._error = "not opened yet"
-        self._use = UseMeter(now)
+
+    @property
+    def echo(self) -> Echo:
+        """Whether the line gives our own requests back."""
+        return self._rtu.echo
 
     def status(self, now: float) -> LineStatus:
         """The line at `now`."""
-        return LineStatus(self._state, self._state_since, self._error, len(self._scheduler), self._use.ratio(now))
+        refresh = [
+            r.device.stats.refresh_s for r in self._records.values() if r.state is DeviceState.ONLINE and not r.night
+        ]
+        known = [refresh_s for refresh_s in refresh if refresh_s is not None]
+        stretch = max(1.0, sum(known) / len(known) / self.settings.poll.live_s) if known else 1.0
+        use = self._accounting.use_ratio(now)
+        return LineStatus(self._state, self._state_since, self._error, len(self._scheduler), use, stretch)
 
     def opened(self, now: float) -> None:
-        """The port is open: everything that is due is read, quarantined devices are probed at once."""
+        """The port is open: everything is read anew, quarantined devices are probed at once."""
         self._set_state(LineState.OPEN, "", now)
         self.stats.opens += 1
         self._rtu.reset(now)
         for record in self._records.values():
             record.breaker.line_opened(now)
-            self._restart_polls(record, now)
+            self._polling.restart(record, now)
 
     def closed(self, error: str, now: float) -> None:
         """The port is closed: what waited ends with LineDown, online devices become stale."""
         self._set_state(LineState.DOWN, error, now)
         self._rtu.reset(now)
-        if self._job is not None:
-            job, self._job = self._job, None
-            self._account(now, failed="line_down")
-            if isinstance(job, ClientRead):
-                self._finish(job, LineDown(error))
-        for read in self._scheduler.drain():
-            self._finish(read, LineDown(error))
+        if self._turn is not None:
+            turn, self._turn = self._turn, None
+            self._accounting.ended(turn, self._sent_at, now, "line_down")
+            self._finish(_waiters(turn), LineDown(error))
+        self._finish(self._scheduler.drain(), LineDown(error))
         for record in self._records.values():
             if record.state is DeviceState.ONLINE:
                 self._change(record, DeviceState.STALE, now, reason="line down")
 
-    def submit(self, device: Device, pdu: bytes, done: Callable[[Outcome], None], now: float) -> Waiter:
-        """Queue a client's read; `done` is called by a later `step`, exactly once."""
-        record = self._records[device.unit_id]
-        waiter = Waiter(done)
-        if not pdu or pdu[0] not in READ_FUNCTIONS:
-            self._finished.append((waiter, IllegalFunction("only reads are sent")))
-        elif self._state is LineState.DOWN:
-            self._finished.append((waiter, LineDown(self._error)))
-        elif record.breaker.is_open:
-            self._finished.append((waiter, DeviceOffline(device.name)))
+    def read(
+        self, device: Device, pdu: bytes, done: Callable[[Outcome], None], now: float, *, client: str, lane: Lane
+    ) -> Waiter:
+        """Queue a read; `done` is called by a later `step`, exactly once."""
+        waiter = Waiter(done, client, now)
+        try:
+            self._check(device)
+            span = _span(device, pdu)
+            loser = self._scheduler.add_read(device, pdu, span, waiter, lane)
+        except RequestError as error:
+            self._finish([waiter], error)
         else:
-            try:
-                self._scheduler.add(device, pdu, waiter, now)
-            except RequestError as error:
-                self._finished.append((waiter, error))
+            if loser is not None:
+                self._finish(loser.waiters, QueueFull("another client asked for less"))
+        return waiter
+
+    def write(self, device: Device, pdu: bytes, done: Callable[[Outcome], None], now: float, *, client: str) -> Waiter:
+        """Queue a single write (rules 2, 4 and 5); `done` is called by a later `step`, exactly once."""
+        waiter = Waiter(done, client, now)
+        try:
+            if not self.settings.writes or len(pdu) != 5 or pdu[0] not in _WRITES:
+                raise IllegalFunction("this line sends no such write")
+            self._check(device)
+            if self._rtu.echo is Echo.UNKNOWN:
+                raise EchoUnknown("nothing was read on this line yet")
+            point = _written_point(device, pdu)
+            lane = Lane.SLAVE_CONTROL if point is not None and point.rewrite_s is not None else Lane.WRITE
+            self._scheduler.add_write(WriteTurn(device, pdu, lane, now, waiter))
+        except RequestError as error:
+            self._finish([waiter], error)
         return waiter
 
     def receive(self, data: bytes, now: float) -> None:
@@ -136,8 +177,10 @@ class LineEngine:
         event = self._rtu.on_timer(now)
         if event is not None:
             self._on_event(event, now)
-        for read in self._scheduler.expired(now):
-            self._finish(read, QueueTimeout(f"waited {self.settings.queue_limit_s:g} s"))
+        self._finish(self._scheduler.expired(now), QueueTimeout(f"waited {self.settings.queue_limit_s:g} s"))
+        for record in self._records.values():
+            if record.rewrites:
+                self._polling.watch_rewrites(record, now)
 
     def step(self, now: float) -> bytes | None:
         """Hand out outcomes, then give the frame to write now, or None."""
@@ -147,19 +190,19 @@ class LineEngine:
                 waiter.finish(outcome)
             except Exception:  # the edge to a face: its mistake must not stop the line
                 log.exception("event=outcome_handler_failed line=%s", self.settings.name)
-        if self._state is LineState.DOWN or self._job is not None or self._rtu.ready_at(now) > now:
+        if self._state is LineState.DOWN or self._turn is not None or self._rtu.ready_at(now) > now:
             return None
-        job = self._scheduler.next(now)
-        if job is None:
+        turn = self._scheduler.next(now)
+        if turn is None:
             return None
         try:
-            frame = self._rtu.send(job.device.address, job.pdu, now, self.settings.reply_timeout_s)
+            frame = self._rtu.send(turn.device.address, turn.pdu, now, self.settings.reply_timeout_s)
         except RequestError as error:  # a client's PDU that has no meaning on a serial line
-            if isinstance(job, ClientRead):
-                self._finish(job, error)
-                return self.step(now)
-            raise
-        self._sent(job, now)
+            if isinstance(turn, PollItem):
+                raise
+            self._finish(_waiters(turn), error)
+            return self.step(now)
+        self._sent(turn, now)
         return frame
 
     def bytes_due(self) -> int:
@@ -173,161 +216,134 @@ class LineEngine:
         if self._state is LineState.DOWN:
             return None
         moments = [self._rtu.next_deadline(), self._scheduler.next_expiry()]
-        if self._job is None and self._rtu.state is State.IDLE:
+        moments += [self._polling.next_warning(record) for record in self._records.values() if record.rewrites]
+        if self._turn is None and self._rtu.state is State.IDLE:
             due = self._scheduler.next_due(now)
             moments.append(None if due is None else max(due, self._rtu.ready_at(now)))
         return min((moment for moment in moments if moment is not None), default=None)
 
-    def _first_polls(self, device: Device, now: float) -> list[PollItem]:
-        """The plan, and what is asked once."""
-        poll = self.settings.poll
-        period_s = {PollClass.LIVE: poll.live_s, PollClass.SETTINGS: poll.settings_s}
-        blocks = [_poll_item(device, block, period_s[block.poll], now) for block in poll_plan(device.map)]
-        return sorted(blocks + self._once(device, now), key=_rank)
+    def _check(self, device: Device) -> None:
+        """Raise why nothing can be asked of this device now."""
+        record = self._records[device.unit_id]
+        if self._state is LineState.DOWN:
+            raise LineDown(self._error)
+        if record.breaker.is_open:
+            raise DeviceOffline(device.name)
+        if not record.verified and (
+            record.known.at or record.known.product or IDENTITY_MISMATCH in device.snapshot.warnings
+        ):
+            raise IdentityUnproven(device.name)
 
-    def _once(self, device: Device, now: float) -> list[PollItem]:
-        """What is asked once after each start: who are you."""
-        items = [PollItem(device, Purpose.IDENTIFY, read_identification_request(), None, None, now)]
-        if device.map.identity.serial_first is not None:
-            function = device.map.read_function(Space.REGISTERS)
-            request = ReadRequest(function, device.map.identity.serial_first, device.map.identity.serial_words)
-            items.append(PollItem(device, Purpose.SERIAL_NUMBER, request.encode(), None, None, now))
-        return items
-
-    def _restart_polls(self, record: DeviceRecord, now: float) -> None:
-        """Everything is read anew; blocks that were split stay split."""
-        items = [item for item in record.polls.items if item.block is not None]
-        for item in items:
-            item.restart(now)
-        record.polls.items = sorted(items + self._once(record.device, now), key=_rank)
-
-    def _sent(self, job: Job, now: float) -> None:
-        self._job = job
+    def _sent(self, turn: Turn, now: float) -> None:
+        self._turn = turn
         self._sent_at = now
-        self.stats.sent += 1
-        if isinstance(job, ClientRead):
-            job.attempts += 1
-            self.stats.client_reads += 1
-            self.stats.retries += job.attempts > 1
-        else:
-            self.stats.polls += 1
-            job.device.stats.polls += 1
-            if job.period_s is not None:
-                job.due = now + job.period_s
+        if isinstance(turn, PollItem):
+            self._polling.started(turn, self._records[turn.device.unit_id], now)
+        elif isinstance(turn, ReadTurn):
+            for read in turn.reads:
+                read.attempts += 1
+        self._accounting.sent(turn, now)
 
     def _on_event(self, event: Replied | Failed, now: float) -> None:
-        job, self._job = self._job, None
-        assert job is not None, "the RTU client reports only what was sent"
-        record = self._records[job.device.unit_id]
+        turn, self._turn = self._turn, None
+        assert turn is not None, "the RTU client reports only what was sent"
+        record = self._records[turn.device.unit_id]
         if isinstance(event, Failed):
-            self._account(now, failed=event.error.label)
-            self._on_failure(job, record, event.error, now)
-            return
-        self._heard(record, now)
-        exception = is_exception(event.pdu)
-        self._account(now, failed="exception" if exception else None)
-        job.device.stats.exceptions += exception
-        if isinstance(job, ClientRead):
-            record.heard(now)
-            self._finish(job, event.pdu)
-        elif exception:
-            self._on_poll_exception(job, record, event.pdu[1], now)
+            self._accounting.ended(turn, self._sent_at, now, event.error.label)
+            self._on_failure(turn, record, event.error, now)
         else:
-            self._on_poll_reply(job, record, event, now)
+            exception = is_exception(event.pdu)
+            turn.device.stats.exceptions += exception
+            self._accounting.ended(turn, self._sent_at, now, "exception" if exception else None)
+            self._heard(record, now)
+            self._on_reply(turn, record, event, now)
+        if isinstance(turn, ReadTurn):
+            self._scheduler.charge(turn, now - self._sent_at)
         self._judge(record, now)
 
-    def _on_poll_reply(self, item: PollItem, record: DeviceRecord, event: Replied, now: float) -> None:
-        item.misses = 0
-        if item.block is not None:
-            block = item.block
-            item.fresh = True
-            record.store(Block(block.space, block.first, block.count, event.pdu[2:], event.sent_at), now)
-        elif item.purpose is Purpose.IDENTIFY:
-            record.polls.items.remove(item)
-            objects = parse_identification(event.pdu).objects
-            vendor, product, revision = (
-                objects.get(number, b"").decode("ascii", "replace").strip("\0 ") for number in range(3)
-            )
-            record.identified(Identification(vendor, product, revision), now)
-        else:
-            record.polls.items.remove(item)
-            record.numbered(_printable(event.pdu[2:]), now)
-
-    def _on_poll_exception(self, item: PollItem, record: DeviceRecord, code: int, now: float) -> None:
+    def _on_reply(self, turn: Turn, record: DeviceRecord, event: Replied, now: float) -> None:
+        if isinstance(turn, PollItem):
+            if is_exception(event.pdu):
+                self._polling.refused(turn, record, event.pdu[1], now)
+            else:
+                self._polling.replied(turn, record, event, now)
+            return
         record.heard(now)
-        if item.block is None:
-            record.polls.items.remove(item)  # the device does not have it: asked once, no failure
-            return
-        item.misses += 1
-        item.device.stats.failures += 1
-        if code not in _REFUSALS_TO_SPLIT:
-            return
-        block = item.block
-        record.polls.items.remove(item)
-        record.drop((block.space, block.first, block.count))
-        halves = split(block, item.device.map)
-        log.info(
-            "event=block_refused device=%s space=%s first=0x%04X count=%d exception=%02X action=%s",
-            item.device.name,
-            block.space,
-            block.first,
-            block.count,
-            code,
-            "dropped" if halves is None else "split",
-        )
-        if halves is not None and item.period_s is not None:
-            record.polls.items += [_poll_item(item.device, half, item.period_s, now) for half in halves]
+        if isinstance(turn, WriteTurn):
+            if not is_exception(event.pdu):
+                self._written(turn, record, now)
+            self._finish([turn.waiter], event.pdu)
+        elif is_exception(event.pdu) and len(turn.reads) > 1:
+            if turn.span is not None and event.pdu[1] in _REFUSALS:
+                record.polls.refused(turn.span.space, turn.span.count)
+            for read in reversed(turn.reads):
+                read.alone = True
+                self._scheduler.retry(read)
+        else:
+            for read in turn.reads:
+                self._finish(read.waiters, _answer(turn, read, event.pdu))
 
-    def _on_failure(self, job: Job, record: DeviceRecord, error: RequestError, now: float) -> None:
-        job.device.stats.failures += 1
-        optional = isinstance(job, PollItem) and job.purpose is Purpose.SERIAL_NUMBER
-        if isinstance(error, ReplyTimeout):
-            if not optional:
-                record.breaker.missed(now)
-        else:
+    def _on_failure(self, turn: Turn, record: DeviceRecord, error: RequestError, now: float) -> None:
+        silent = isinstance(error, ReplyTimeout)
+        if isinstance(turn, WriteTurn):
+            point = _written_point(turn.device, turn.pdu)
+            if silent and point is not None and point.restarts:
+                self._written(turn, record, now)
+                record.restarting_until = now + RESTART_S
+                self._finish([turn.waiter], turn.pdu)  # the answer to a write is its echo
+                return
+        turn.device.stats.failures += 1
+        if not silent:
             self._heard(record, now)  # it speaks, if not clearly
-        if isinstance(job, PollItem):
-            job.misses += 1
-            if job.period_s is None:
-                job.due = now + self.settings.poll.live_s
-                if job.misses >= MISSES_TO_OPEN or optional:
-                    record.polls.items.remove(job)
-        elif record.breaker.is_open or job.attempts > self.settings.retries or not job.wanted:
-            self._finish(job, error)
+        elif now >= record.restarting_until and not (isinstance(turn, PollItem) and turn.optional):
+            record.breaker.missed(now)
+        if isinstance(turn, PollItem):
+            self._polling.failed(turn, record, now)
+        elif isinstance(turn, WriteTurn):
+            self._written(turn, record, now)  # perhaps: what was there is not known any more
+            self._finish([turn.waiter], error)
         else:
-            self._scheduler.retry(job)
-        self._judge(record, now)
+            for read in reversed(turn.reads):
+                if record.breaker.is_open or read.attempts > self.settings.retries or not read.wanted:
+                    self._finish(read.waiters, error)
+                else:
+                    self._scheduler.retry(read)
+
+    def _written(self, turn: WriteTurn, record: DeviceRecord, now: float) -> None:
+        """A write was, or may have been, taken: forget the old value and watch what must be rewritten."""
+        space = turn.device.map.write_functions[turn.pdu[0]]
+        address = int.from_bytes(turn.pdu[1:3], "big")
+        self._polling.wanted_again(record, space, address, now)
+        point = _written_point(turn.device, turn.pdu)
+        if point is None or point.rewrite_s is None:
+            return
+        if any(turn.pdu[3:5]):
+            record.rewrites[point.name] = now
+        else:
+            record.rewrites.pop(point.name, None)
+        self._polling.watch_rewrites(record, now)
 
     def _heard(self, record: DeviceRecord, now: float) -> None:
         """The device is there; after a quarantine everything is read anew."""
+        record.restarting_until = 0.0
         if record.breaker.is_open:
-            self._restart_polls(record, now)
+            self._polling.restart(record, now)
         record.breaker.replied()
 
     def _judge(self, record: DeviceRecord, now: float) -> None:
-        """Rule 2: the state that follows from breaker and live blocks."""
-        live = [item for item in record.polls.items if item.block is not None and item.block.poll is PollClass.LIVE]
-        state = record.state
-        if record.breaker.is_open:
-            state = DeviceState.OFFLINE
-        elif state is DeviceState.ONLINE and any(item.misses >= MISSES_TO_OPEN for item in live):
-            state = DeviceState.STALE
-        elif live and all(item.fresh and item.misses == 0 for item in live):
-            state = DeviceState.ONLINE
+        state = self._polling.judge(record)
         if state is record.state:
             return
         self._change(record, state, now, reason="silent" if state is DeviceState.OFFLINE else "")
         if state is DeviceState.OFFLINE:
             record.device.stats.went_offline += 1
-            for read in self._scheduler.take_device(record.device):
-                self._finish(read, DeviceOffline(record.device.name))
+            self._finish(self._scheduler.drain(record.device), DeviceOffline(record.device.name))
 
     def _change(self, record: DeviceRecord, state: DeviceState, now: float, reason: str) -> None:
         before = record.state
         lasted_s = record.become(state, now)
-        level = logging.INFO if state is DeviceState.ONLINE else logging.WARNING
         log.log(
-            level,
+            logging.INFO if state is DeviceState.ONLINE else logging.WARNING,
             "event=device_%s line=%s device=%s address=%d before=%s lasted_s=%.1f%s",
             state,
             self.settings.name,
@@ -338,16 +354,8 @@ class LineEngine:
             f' reason="{reason}"' if reason else "",
         )
 
-    def _account(self, now: float, failed: str | None) -> None:
-        self.stats.busy_s += now - self._sent_at
-        self._use.add(self._sent_at, now)
-        if failed is None:
-            self.stats.ok += 1
-        else:
-            self.stats.failed[failed] += 1
-
-    def _finish(self, read: ClientRead, outcome: Outcome) -> None:
-        self._finished.extend((waiter, outcome) for waiter in read.waiters)
+    def _finish(self, waiters: Iterable[Waiter], outcome: Outcome) -> None:
+        self._finished.extend((waiter, outcome) for waiter in waiters)
 
     def _set_state(self, state: LineState, error: str, now: float) -> None:
         if state is not self._state:
@@ -356,19 +364,28 @@ class LineEngine:
         self._error = error
 
 
-def _poll_item(device: Device, block: PlannedBlock, period_s: float, due: float) -> PollItem:
-    request = ReadRequest(device.map.read_function(block.space), block.first, block.count)
-    return PollItem(device, Purpose.POLL, request.encode(), block, period_s, due)
+def _waiters(turn: Turn) -> list[Waiter]:
+    if isinstance(turn, ReadTurn):
+        return [waiter for read in turn.reads for waiter in read.waiters]
+    return [turn.waiter] if isinstance(turn, WriteTurn) else []
 
 
-def _rank(item: PollItem) -> int:
-    """Order of the first round: values on every face soon after start matter more than names."""
-    if item.block is not None:
-        return 0 if item.block.poll is PollClass.LIVE else 2
-    return 1 if item.purpose is Purpose.IDENTIFY else 3
+def _answer(turn: ReadTurn, read: ClientRead, reply: bytes) -> bytes:
+    """The read's own part of a turn's reply."""
+    if len(turn.reads) == 1 or turn.span is None or read.span is None:
+        return reply
+    return part(reply, turn.span, read.span)
 
 
-def _printable(words: bytes) -> str:
-    """Registers as ASCII text; "" when they hold anything else (the number is undocumented)."""
-    text = words.strip(b"\0\xff ")
-    return text.decode("ascii") if text.isascii() and text.decode("ascii", "replace").isprintable() else ""
+def _span(device: Device, pdu: bytes) -> Span | None:
+    """What a read asks for; None for identification. Raises the RequestError that refuses anything else."""
+    if pdu and pdu[0] in _READS and pdu[0] in device.map.functions:
+        return Span.of(device, parse_read(pdu))
+    if pdu and pdu[0] == Function.READ_IDENTIFICATION:
+        return None
+    raise IllegalFunction("only reads are sent")
+
+
+def _written_point(device: Device, pdu: bytes) -> Point | None:
+    space = device.map.write_functions.get(pdu[0])
+    return None if space is None else device.map.writable_point(space, int.from_bytes(pdu[1:3], "big"))

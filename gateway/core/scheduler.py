@@ -1,111 +1,48 @@
 """Whose turn it is on a line.
 
-Rule 1: a client's read goes before a poll, except that a poll which is late by a whole period goes
-        after at most one client read: clients cannot stop the polls, polls cannot stop the clients.
-Rule 2: of the polls, the one that was due first goes first; after its turn it is due one period
-        after it was started, so that on a line too slow for its polls all periods stretch alike and
-        a pause (suspend, a line that was down) is followed by one round, not by a burst.
-Rule 3: a quarantined device has one poll, its probe, when its breaker says so.
-Rule 4: identical reads that wait for one device are one read with several waiters; a waiter that
-        leaves takes nothing from the others, and a read whose last waiter left is not made.
-Rule 5: at most `limit` client reads wait; one that waited longer than `limit_s` is given up.
+Rule 1: lanes by precedence: slave control, other writes, client reads, polls, background (requests.Lane).
+Rule 2: ageing, so that no lane starves: a lane whose head has waited longer than the lane's patience (a poll: a
+        whole period) goes next after one turn of a higher lane; of several such lanes the one passed over most.
+Rule 3: of the polls, the one that was due first goes first; after its turn it is due one period after it was
+        started, so that on a line too slow for its polls all periods stretch alike, and a pause (suspend, a line
+        that was down) is followed by one round, not by a burst.
+Rule 4: a quarantined device has one poll, its probe, when its breaker says so.
+Rule 5: background reads go only when they are over before the next poll is due (or by rule 2).
+Rule 6: client reads share the line fairly (fairness.py) and are joined where that saves line time (coalescing.py).
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from enum import StrEnum
 
+from gateway.core.coalescing import Cost, join
+from gateway.core.fairness import FairQueue
 from gateway.core.health import Breaker
-from gateway.core.site import Device, Outcome
-from gateway.devices.plan import PlannedBlock
+from gateway.core.requests import ClientRead, Lane, PollItem, Purpose, ReadTurn, Span, Turn, Waiter, WriteTurn
+from gateway.core.site import Device
+from gateway.devices.model import Space
+from gateway.devices.plan import limit as protocol_limit
 from gateway.errors import QueueFull
+from gateway.modbus.pdu import ReadRequest
 
-
-class Purpose(StrEnum):
-    """What a transaction is for."""
-
-    CLIENT = "client"
-    POLL = "poll"
-    IDENTIFY = "identify"
-    SERIAL_NUMBER = "serial_number"
-
-
-class Waiter:
-    """One asker of a client read; the `Ticket` it holds."""
-
-    __slots__ = ("_done",)
-
-    def __init__(self, done: Callable[[Outcome], None]) -> None:
-        self._done: Callable[[Outcome], None] | None = done
-
-    @property
-    def left(self) -> bool:
-        """Whether the asker is gone."""
-        return self._done is None
-
-    def cancel(self) -> None:
-        """See `core.site.Ticket`."""
-        self._done = None
-
-    def finish(self, outcome: Outcome) -> None:
-        """Tell the asker, once, unless it left."""
-        done, self._done = self._done, None
-        if done is not None:
-            done(outcome)
-
-
-@dataclass(slots=True, eq=False)
-class ClientRead:
-    """A read that clients wait for."""
-
-    device: Device
-    pdu: bytes
-    queued_at: float
-    attempts: int = 0
-    waiters: list[Waiter] = field(default_factory=list)
-
-    @property
-    def wanted(self) -> bool:
-        """Whether anybody still waits."""
-        return any(not waiter.left for waiter in self.waiters)
-
-
-@dataclass(slots=True, eq=False)
-class PollItem:
-    """One recurring (or one-time) read of a device."""
-
-    device: Device
-    purpose: Purpose
-    pdu: bytes
-    block: PlannedBlock | None
-    period_s: float | None  # None: done once, then dropped
-    due: float
-    misses: int = 0  # attempts in a row that gave no data
-    fresh: bool = False  # whether it gave data since the line was opened or the device came back
-
-    def restart(self, now: float) -> None:
-        """Due at once, and nothing is known: another unit may stand there now."""
-        self.due = now
-        self.misses = 0
-        self.fresh = False
-
-
-Job = ClientRead | PollItem
+PATIENCE_S = {Lane.SLAVE_CONTROL: 0.0, Lane.WRITE: 0.5, Lane.CLIENT: 1.0, Lane.BACKGROUND: 30.0}
+SLAVE_TURNS = 4
+"""How often slave control may go ahead of a lane that has waited too long."""
 
 
 @dataclass(slots=True, eq=False)
 class PollList:
-    """The polls of one device and its breaker."""
+    """The polls of one device, its breaker, and what was learnt about its limits."""
 
     device: Device
     breaker: Breaker
     items: list[PollItem] = field(default_factory=list)
+    most: dict[Space, int] = field(default_factory=dict)  # space → the longest read not yet refused
 
     def first(self) -> tuple[float, PollItem] | None:
-        """The poll that is due first and when (rule 3); None when the device has none."""
+        """The poll that is due first and when (rule 4); None when the device has none."""
         if not self.items:
             return None
         if self.breaker.probe_at is not None:
@@ -114,106 +51,157 @@ class PollList:
         item = min(self.items, key=lambda item: item.due)
         return item.due, item
 
+    def most_in(self, space: Space) -> int:
+        """The longest read of this space that makes sense."""
+        return min(protocol_limit(space), self.most.get(space, protocol_limit(space)))
+
+    def refused(self, space: Space, count: int) -> None:
+        """The device did not take a read of `count`."""
+        self.most[space] = max(1, min(self.most_in(space), count - 1))
+
 
 class Scheduler:
-    """The queue of one line."""
+    """The queues of one line."""
 
-    def __init__(self, polls: Iterable[PollList], *, limit: int, limit_s: float) -> None:
-        self._polls = tuple(polls)
+    def __init__(self, polls: Iterable[PollList], *, limit: int, limit_s: float, cost: Cost, now: float) -> None:
+        self._polls = {list_.device.unit_id: list_ for list_ in polls}
         self._limit = limit
-        self._limit_s = limit_s
-        self._reads: deque[ClientRead] = deque()
-        self._waiting: dict[tuple[int, bytes], ClientRead] = {}
-        self._client_went_last = False
+        self._cost = cost
+        self._clients = FairQueue(Lane.CLIENT, limit=limit, limit_s=limit_s)
+        self._background = FairQueue(Lane.BACKGROUND, limit=limit, limit_s=float("inf"))
+        self._writes: dict[Lane, deque[WriteTurn]] = {Lane.SLAVE_CONTROL: deque(), Lane.WRITE: deque()}
+        self._served_at = dict.fromkeys(Lane, now)
+        self._passed = dict.fromkeys(Lane, 0)
 
     def __len__(self) -> int:
-        return len(self._reads)
+        return len(self._clients) + len(self._background) + sum(map(len, self._writes.values()))
 
-    def add(self, device: Device, pdu: bytes, waiter: Waiter, now: float) -> None:
-        """Queue a client read or join an identical one (rule 4); raises QueueFull (rule 5)."""
-        key = (device.unit_id, pdu)
-        read = self._waiting.get(key)
-        if read is None:
-            if len(self._reads) >= self._limit:
-                self._forget_unwanted()
-            if len(self._reads) >= self._limit:
-                raise QueueFull
-            read = ClientRead(device, pdu, now)
-            self._waiting[key] = read
-            self._reads.append(read)
-        read.waiters.append(waiter)
+    def add_read(self, device: Device, pdu: bytes, span: Span | None, waiter: Waiter, lane: Lane) -> ClientRead | None:
+        """Queue a read; see FairQueue.add."""
+        return self._queue(lane).add(device, pdu, span, waiter)
+
+    def add_write(self, write: WriteTurn) -> None:
+        """Queue a write; raises QueueFull."""
+        queue = self._writes[write.lane]
+        if len(queue) >= self._limit:
+            raise QueueFull
+        queue.append(write)
 
     def retry(self, read: ClientRead) -> None:
-        """Put a read that failed back at the head of the queue."""
-        self._reads.appendleft(read)
-        self._waiting.setdefault((read.device.unit_id, read.pdu), read)
+        """Put a read that failed back at the head of its queue."""
+        self._queue(read.lane).retry(read)
 
-    def expired(self, now: float) -> list[ClientRead]:
-        """Take out the reads that waited too long (rule 5)."""
-        out: list[ClientRead] = []
-        while self._reads and self._reads[0].queued_at + self._limit_s <= now:
-            out.append(self._take())
-        return out
+    def charge(self, turn: ReadTurn, seconds: float) -> None:
+        """Book the line time of a finished read on its clients."""
+        clients = list(dict.fromkeys(waiter.client for read in turn.reads for waiter in read.waiters))
+        self._queue(turn.lane).charge(clients, seconds)
+
+    def expired(self, now: float) -> list[Waiter]:
+        """Take out the askers of client reads that waited too long."""
+        return self._clients.expired(now)
 
     def next_expiry(self) -> float | None:
         """When the oldest client read will have waited too long."""
-        return self._reads[0].queued_at + self._limit_s if self._reads else None
+        return self._clients.next_expiry()
 
-    def drain(self) -> list[ClientRead]:
-        """Take out all client reads: the line is down."""
-        out = list(self._reads)
-        self._reads.clear()
-        self._waiting.clear()
-        return out
-
-    def take_device(self, device: Device) -> list[ClientRead]:
-        """Take out the client reads of one device: it was quarantined."""
-        out = [read for read in self._reads if read.device is device]
-        for read in out:
-            self._reads.remove(read)
-            self._waiting.pop((read.device.unit_id, read.pdu), None)
-        return out
+    def drain(self, device: Device | None = None) -> list[Waiter]:
+        """Take out all requests (the line is down), or those of one device (it was quarantined)."""
+        reads = self._clients.drain(device) + self._background.drain(device)
+        waiters = [waiter for read in reads for waiter in read.waiters]
+        for lane, queue in self._writes.items():
+            waiters += [write.waiter for write in queue if device is None or write.device is device]
+            self._writes[lane] = deque(write for write in queue if device is not None and write.device is not device)
+        return waiters
 
     def next_due(self, now: float) -> float | None:
         """When there is something to do; `now` or earlier: at once. None: never."""
-        if any(read.wanted for read in self._reads):
+        if any(self._write_head(lane) for lane in self._writes) or self._clients.head() is not None:
             return now
-        firsts = [first[0] for polls in self._polls if (first := polls.first()) is not None]
-        return min(firsts, default=None)
+        due = self._next_poll_due()
+        background = self._background.head()
+        if background is not None:
+            fits_at = now if due is None or now + self._read_s(background) <= due else due
+            aged_at = max(background.queued_at, self._served_at[Lane.BACKGROUND]) + PATIENCE_S[Lane.BACKGROUND]
+            return min(fits_at, max(aged_at, now))
+        return due
 
-    def next(self, now: float) -> Job | None:
-        """Take the job whose turn it is at `now`, or None (rules 1 and 2)."""
-        self._forget_unwanted_head()
+    def next(self, now: float) -> Turn | None:
+        """Take the turn whose time it is at `now`, or None."""
+        ready: dict[Lane, float] = {}  # lane → when its head will have waited too long
+        for lane in self._writes:
+            write = self._write_head(lane)
+            if write is not None:
+                ready[lane] = write.queued_at + PATIENCE_S[lane]
+        client = self._clients.head()
+        if client is not None:
+            ready[Lane.CLIENT] = max(client.queued_at, self._served_at[Lane.CLIENT]) + PATIENCE_S[Lane.CLIENT]
         poll = self._due_poll(now)
-        if self._reads:
-            overdue = poll is not None and poll[0] + (poll[1].period_s or 0.0) <= now
-            if not (overdue and self._client_went_last):
-                self._client_went_last = True
-                return self._take()
-        self._client_went_last = False
-        return poll[1] if poll is not None else None
+        if poll is not None:
+            ready[Lane.POLL] = poll[0] + (poll[1].period_s or 0.0)
+        background = self._background.head()
+        if background is not None:
+            due = self._next_poll_due()
+            aged_at = max(background.queued_at, self._served_at[Lane.BACKGROUND]) + PATIENCE_S[Lane.BACKGROUND]
+            if aged_at <= now or due is None or now + self._read_s(background) <= due:
+                ready[Lane.BACKGROUND] = aged_at
+        if not ready:
+            return None
+        lane = self._choose(ready, now)
+        self._served_at[lane] = now
+        if lane in self._writes:
+            return self._writes[lane].popleft()
+        if lane is Lane.POLL:
+            assert poll is not None
+            return poll[1]
+        head = client if lane is Lane.CLIENT else background
+        assert head is not None
+        return self._join(head)
+
+    def _choose(self, ready: dict[Lane, float], now: float) -> Lane:
+        """Rules 1 and 2."""
+        first = min(ready)
+        aged = [lane for lane, at in ready.items() if at <= now and self._passed[lane] > 0]
+        chosen = max(aged, key=lambda lane: (self._passed[lane], -lane)) if aged else first
+        if first is Lane.SLAVE_CONTROL and self._passed[chosen] < SLAVE_TURNS:
+            chosen = first
+        for lane, at in ready.items():
+            if lane > chosen and at <= now:
+                self._passed[lane] += 1
+        self._passed[chosen] = 0
+        return chosen
+
+    def _join(self, head: ClientRead) -> ReadTurn:
+        queue = self._queue(head.lane)
+        polls = self._polls[head.device.unit_id]
+        span, reads = join(
+            head, queue.of_device(head.device), cost=self._cost, mapped=head.device.map.covers, most=polls.most_in
+        )
+        for read in reads:
+            queue.take(read)
+        pdu = head.pdu
+        if span is not None and span != head.span:
+            pdu = ReadRequest(span.function, span.first, span.count).encode()
+        return ReadTurn(head.device, head.lane, pdu, span, reads)
+
+    def _queue(self, lane: Lane) -> FairQueue:
+        return self._background if lane is Lane.BACKGROUND else self._clients
+
+    def _write_head(self, lane: Lane) -> WriteTurn | None:
+        queue = self._writes[lane]
+        while queue and queue[0].waiter.left:
+            queue.popleft()
+        return queue[0] if queue else None
+
+    def _read_s(self, read: ClientRead) -> float:
+        return self._cost(Space.REGISTERS, 3) if read.span is None else self._cost(read.span.space, read.span.count)
+
+    def _next_poll_due(self) -> float | None:
+        return min((first[0] for polls in self._polls.values() if (first := polls.first()) is not None), default=None)
 
     def _due_poll(self, now: float) -> tuple[float, PollItem] | None:
         best: tuple[float, PollItem] | None = None
-        for polls in self._polls:
+        for polls in self._polls.values():
             first = polls.first()
             if first is not None and first[0] <= now and (best is None or first[0] < best[0]):
                 best = first
         return best
-
-    def _take(self) -> ClientRead:
-        read = self._reads.popleft()
-        if self._waiting.get((read.device.unit_id, read.pdu)) is read:
-            del self._waiting[(read.device.unit_id, read.pdu)]
-        return read
-
-    def _forget_unwanted_head(self) -> None:
-        while self._reads and not self._reads[0].wanted:
-            self._take()
-
-    def _forget_unwanted(self) -> None:
-        for _ in range(len(self._reads)):
-            read = self._take()
-            if read.wanted:
-                self._reads.append(read)
-                self._waiting[(read.device.unit_id, read.pdu)] = read

@@ -13,6 +13,7 @@ class PollSettings:
 
     live_s: float = 1.0
     settings_s: float = 300.0
+    night_s: float | None = None  # live values while the device says that it is night; None: as by day
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +33,7 @@ class LineSettings:
     gap_s: float = 0.0  # extra silence between frames for slow devices; never below 3.5 characters
     queue_limit: int = 64  # waiting client reads; over it exception 06
     queue_limit_s: float = 5.0  # a client read that waited longer is answered 06
+    writes: bool = False  # whether this line ever sends a write
     poll: PollSettings = PollSettings()
 
     def timing(self) -> Timing:

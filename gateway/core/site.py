@@ -12,6 +12,7 @@ from enum import StrEnum
 from types import MappingProxyType
 from typing import Protocol
 
+from gateway.core.identity import Identity
 from gateway.core.snapshot import Snapshot
 from gateway.core.stats import DeviceStats, LineStats
 from gateway.devices.model import DeviceMap
@@ -37,6 +38,7 @@ class LineStatus:
     error: str  # why it is down; "" when open
     queue_depth: int
     use_ratio: float  # share of the last minute in which a transaction was on the wire, 0..1
+    stretch: float = 1.0  # how much longer live values take than asked for; 1 where the line keeps up
 
 
 class Ticket(Protocol):
@@ -74,11 +76,22 @@ class LinePort(Protocol):
         """State, queue and use at `now`."""
         ...
 
-    def read(self, device: Device, pdu: bytes, done: Callable[[Outcome], None]) -> Ticket:
-        """Ask the line for one read.
+    def read(
+        self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "", background: bool = False
+    ) -> Ticket:
+        """Ask the line for one read (functions 01 to 04 and 2B/0E) for `client`, who gets a fair share of the line.
 
         `done` is called exactly once, from the event loop and never before `read` returns, unless the
-        ticket was cancelled. Identical reads that wait for the same device share one transaction.
+        ticket was cancelled. Reads that wait for the same device share transactions where that saves line time.
+        A background read waits until the line has time for it.
+        """
+        ...
+
+    def write(self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "") -> Ticket:
+        """Ask the line for one single write (functions 05 and 06), which is made once and never repeated.
+
+        `done` as for `read`. Who may write what is for the caller to decide; a line whose settings do not allow
+        writes refuses it. ReplyTimeout means that nobody knows whether the device has taken it.
         """
         ...
 
@@ -92,6 +105,7 @@ class Device:
     address: int
     map: DeviceMap
     decode: Mapping[str, str] = field(default_factory=dict)  # point name → reading name
+    expected: Identity = field(default_factory=Identity)  # what is configured of the unit itself
     line: LinePort = field(init=False)
     snapshot: Snapshot = field(default_factory=Snapshot)
     stats: DeviceStats = field(default_factory=DeviceStats)

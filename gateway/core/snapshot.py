@@ -56,6 +56,7 @@ class Snapshot:
     read_at: Mapping[str, float] = field(default_factory=lambda: _NO_TIMES)  # point name → its block's read_at
     identification: Identification | None = None
     serial_number: str | None = None
+    warnings: frozenset[str] = frozenset()  # conditions that the gateway itself sees, such as "identity_mismatch"
 
     def shown(self) -> Mapping[str, Value]:
         """Values that a face may show now: all of an online device, none of any other."""

@@ -5,9 +5,10 @@ Plain mutable numbers on one loop: an increment is the whole cost.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 
+from gateway.core.histogram import Histogram
 from gateway.modbus.counters import RtuCounters
 
 
@@ -20,9 +21,15 @@ class LineStats:
     failed: Counter[str] = field(default_factory=Counter)  # error label → count, incl. "exception"
     retries: int = 0
     polls: int = 0
-    client_reads: int = 0
+    client_reads: int = 0  # transactions made for clients and the history
+    joined: int = 0  # reads that shared another's transaction
+    writes: int = 0
     opens: int = 0
     busy_s: float = 0.0  # time the line was occupied by a transaction
+    seconds_by_purpose: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+    seconds_by_client: dict[str, float] = field(default_factory=dict)
+    queue_wait: Histogram = field(default_factory=Histogram)  # of client reads and writes
+    reply_time: Histogram = field(default_factory=Histogram)  # request out to reply whole
     wire: RtuCounters = field(default_factory=RtuCounters)
 
 
@@ -35,6 +42,10 @@ class DeviceStats:
     exceptions: int = 0
     went_offline: int = 0
     implausible: int = 0
+    line_s: float = 0.0  # line time spent on it
+    errors: Counter[str] = field(default_factory=Counter)  # error label → count
+    refresh_s: float | None = None  # mean period of its live values as of late
+    identity_mismatches: int = 0
 
 
 @dataclass(slots=True)

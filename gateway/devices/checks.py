@@ -142,6 +142,18 @@ def _limits(point: Point) -> Iterator[str]:
         yield "plausible: the first number must be below the second"
 
 
+def _rules(device_map: DeviceMap) -> Iterator[str]:
+    polled = {point.name for point in device_map.points if point.polled}
+    for growing in device_map.identity.growing:
+        if growing.point not in polled:
+            yield f"identity: growing: no polled point {growing.point}"
+    if device_map.night is not None and device_map.night.point not in polled:
+        yield f"night: no polled point {device_map.night.point}"
+    for point in device_map.points:
+        if point.access is Access.READ and (point.rewrite_s is not None or point.restarts):
+            yield f"point {point.name}: rewrite_s and restarts are for what can be written"
+
+
 def _number_tables(device_map: DeviceMap) -> Iterator[str]:
     for kind, tables in (("enumeration", device_map.enumerations), ("bits", device_map.bit_tables)):
         for name, entries in tables.items():
@@ -228,6 +240,7 @@ _CHECKS: tuple[Callable[[DeviceMap], Iterator[str]], ...] = (
     _extents,
     _places,
     _points,
+    _rules,
     _number_tables,
     _mib,
     _metrics,

@@ -124,6 +124,8 @@ class Point:
     plausible: tuple[float, float] | None = None  # a value outside is withheld and counted, never shown
     multiplied_by: str | None = None  # point that multiplies this one before the device uses it
     note: str = ""  # where document and field, or two places of the document, disagree
+    rewrite_s: float | None = None  # a value not zero must be written again at least this often, or the device faults
+    restarts: bool = False  # a write restarts the device, which then does not answer: silence is success
 
     @property
     def polled(self) -> bool:
@@ -191,6 +193,23 @@ class LogLayout:
 
 
 @dataclass(frozen=True, slots=True)
+class Growing:
+    """A counter that only grows, and no faster than `per_hour`: two units rarely agree on it."""
+
+    point: str
+    per_hour: float
+    clearable: bool  # a command sets it to zero
+
+
+@dataclass(frozen=True, slots=True)
+class NightRule:
+    """The value of a point that means that nothing happens until morning."""
+
+    point: str
+    value: int
+
+
+@dataclass(frozen=True, slots=True)
 class IdentityRules:
     """How the model shows itself: Read Device Identification and an optional serial number."""
 
@@ -199,6 +218,7 @@ class IdentityRules:
     vendor: str
     serial_first: int | None
     serial_words: int
+    growing: tuple[Growing, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,6 +237,23 @@ class DeviceMap:
     bit_tables: Mapping[str, tuple[Bit, ...]]
     log: LogLayout | None
     identity: IdentityRules
+    night: NightRule | None = None
+
+    def covers(self, space: Space, first: int, end: int) -> bool:
+        """Whether every address from `first` to one before `end` lies in an extent."""
+        while first < end:
+            inside = [e.last + 1 for e in self.extents if e.space is space and e.first <= first <= e.last]
+            if not inside:
+                return False
+            first = max(inside)
+        return True
+
+    def writable_point(self, space: Space, address: int) -> Point | None:
+        """The point that a single write to this address changes, or None."""
+        for point in self.points:
+            if point.space is space and point.address == address and point.access is not Access.READ:
+                return point
+        return None
 
     def read_function(self, space: Space) -> int:
         """The function that polls read this space with: of those that the device has, the lowest."""

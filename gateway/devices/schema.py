@@ -24,10 +24,12 @@ from gateway.devices.model import (
     EnumValue,
     Extent,
     Group,
+    Growing,
     IdentityRules,
     LogField,
     LogLayout,
     MibColumn,
+    NightRule,
     Point,
     PollClass,
     Reading,
@@ -113,6 +115,8 @@ class _Point(_Form):
     bits: Label | None = None
     confidence: Literal["documented", "low"] = "documented"
     note: str = ""
+    rewrite_s: Annotated[Number, Field(gt=0)] | None = None
+    restarts: bool = False
     mib: _Mib | None = None
     metric: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")] | None = None
     metric_scale: Number = 1
@@ -154,6 +158,8 @@ class _Point(_Form):
             plausible=None if self.plausible is None else (float(self.plausible[0]), float(self.plausible[1])),
             multiplied_by=self.multiplied_by,
             note=self.note,
+            rewrite_s=None if self.rewrite_s is None else float(self.rewrite_s),
+            restarts=self.restarts,
         )
 
 
@@ -196,12 +202,37 @@ class _Log(_Form):
         return LogLayout(self.first, self.blocks, self.block_words, fields, self.doc)
 
 
+class _Growing(_Form):
+    point: Label
+    per_hour: Annotated[Number, Field(gt=0)]
+    clearable: bool = False
+
+    def build(self) -> Growing:
+        return Growing(self.point, float(self.per_hour), self.clearable)
+
+
+class _Night(_Form):
+    point: Label
+    value: int
+
+
 class _Identity(_Form):
     vendor: Text
     product_prefixes: tuple[Text, ...] = Field(strict=False)
     product_codes: tuple[Text, ...] = Field(strict=False)
     serial_first: Address | None = None
     serial_words: Annotated[int, Field(ge=0)] = 0
+    growing: tuple[_Growing, ...] = Field(default=(), strict=False)
+
+    def build(self) -> IdentityRules:
+        return IdentityRules(
+            self.product_prefixes,
+            self.product_codes,
+            self.vendor,
+            self.serial_first,
+            self.serial_words,
+            tuple(growing.build() for growing in self.growing),
+        )
 
 
 FunctionCode = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,2}$")]
@@ -214,6 +245,7 @@ class _File(_Form):
     functions: dict[FunctionCode, SpaceName]
     write_functions: dict[FunctionCode, SpaceName] = {}
     identity: _Identity
+    night: _Night | None = None
     extent: tuple[_Extent, ...] = Field(strict=False)
     reserved: tuple[_Extent, ...] = Field(default=(), strict=False)
     enumeration: dict[Label, Annotated[tuple[_EnumValue, ...], Field(strict=False)]] = {}
@@ -244,7 +276,8 @@ class _File(_Form):
                 }
             ),
             log=None if self.log is None else self.log.build(),
-            identity=IdentityRules(**self.identity.model_dump()),
+            identity=self.identity.build(),
+            night=NightRule(self.night.point, self.night.value) if self.night is not None else None,
         )
 
 

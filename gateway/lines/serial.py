@@ -21,6 +21,7 @@ import serial
 
 from gateway.clock import Clock
 from gateway.core.engine import LineEngine
+from gateway.core.requests import Lane
 from gateway.core.settings import LineSettings
 from gateway.core.site import Device, LineStatus, Outcome, Ticket
 from gateway.core.stats import LineStats
@@ -78,12 +79,24 @@ class SerialLine:
         """See `LinePort.status`."""
         return self._engine.status(now)
 
-    def read(self, device: Device, pdu: bytes, done: Callable[[Outcome], None]) -> Ticket:
+    def read(
+        self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "", background: bool = False
+    ) -> Ticket:
         """See `LinePort.read`."""
-        ticket = self._engine.submit(device, pdu, done, self._clock.monotonic())
+        lane = Lane.BACKGROUND if background else Lane.CLIENT
+        ticket = self._engine.read(device, pdu, done, self._clock.monotonic(), client=client, lane=lane)
+        self._wake_up()
+        return ticket
+
+    def write(self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "") -> Ticket:
+        """See `LinePort.write`."""
+        ticket = self._engine.write(device, pdu, done, self._clock.monotonic(), client=client)
+        self._wake_up()
+        return ticket
+
+    def _wake_up(self) -> None:
         if self._wake is None:
             self._wake = asyncio.get_running_loop().call_soon(self._woken)
-        return ticket
 
     async def run(self) -> None:
         """Own the port until cancelled: open it, serve it, and open it again when it fails."""

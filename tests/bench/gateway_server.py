@@ -37,9 +37,14 @@ class NoLine:
     def status(self, now: float) -> LineStatus:
         return LineStatus(LineState.DOWN, now, "no port", 0, 0.0)
 
-    def read(self, device: Device, pdu: bytes, done: Callable[[Outcome], None]) -> asyncio.Handle:
-        del device, pdu
+    def read(
+        self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "", background: bool = False
+    ) -> asyncio.Handle:
+        del device, pdu, client, background
         return asyncio.get_running_loop().call_soon(done, LineDown())
+
+    def write(self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "") -> asyncio.Handle:
+        return self.read(device, pdu, done, client=client)
 
 
 async def serve(port: int) -> None:

@@ -67,7 +67,7 @@ def test_every_read_ends_within_the_printed_deadline(virtual_line: MakeLine) -> 
 
     for device, address in itertools.product(line.devices, range(8)):
         request = ReadRequest(Function.READ_HOLDING_REGISTERS, address, 125).encode()
-        line.engine.submit(device, request, done, line.now)
+        line.read(device, request, done)
     begin = line.now
     line.run(60.0)
     assert len(ended) == 64

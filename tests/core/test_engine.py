@@ -69,7 +69,7 @@ def registers(address: int, count: int) -> bytes:
 def test_a_device_comes_online_with_values_soon_after_the_line_opens(virtual_line: MakeLine) -> None:
     line = virtual_line(Registers(1), Registers(2))
     assert [device.snapshot.state for device in line.devices] == [DeviceState.UNKNOWN] * 2
-    line.run(1.0)
+    line.run(2.0)
     for device in line.devices:
         assert device.snapshot.state is DeviceState.ONLINE
         assert device.snapshot.shown()
@@ -118,7 +118,7 @@ def test_two_devices_never_get_each_others_reply(virtual_line: MakeLine) -> None
         return done
 
     for index, device in enumerate(line.devices * 20):
-        line.engine.submit(device, registers(index, 1), answered(index), line.now)
+        line.read(device, registers(index, 1), answered(index))
     line.run(10.0)
     assert len(outcomes) == 40
     for index, got in outcomes:
@@ -157,7 +157,7 @@ def test_identical_reads_cost_one_transaction_and_every_waiter_gets_its_answer(v
     line.run(1.0)
     outcomes: list[Outcome] = []
     for _ in range(5):
-        line.engine.submit(line.devices[0], registers(0x500, 3), outcomes.append, line.now)
+        line.read(line.devices[0], registers(0x500, 3), outcomes.append)
     line.run(1.0)
     assert len(outcomes) == 5
     assert len(set(map(bytes, (outcome for outcome in outcomes if isinstance(outcome, bytes))))) == 1
@@ -167,8 +167,8 @@ def test_identical_reads_cost_one_transaction_and_every_waiter_gets_its_answer(v
 def test_a_cancelled_read_is_not_answered_and_does_not_disturb_the_others(virtual_line: MakeLine) -> None:
     line = virtual_line(Registers(1))
     outcomes: list[Outcome] = []
-    gone = line.engine.submit(line.devices[0], registers(1, 1), lambda _: pytest.fail("it was cancelled"), line.now)
-    line.engine.submit(line.devices[0], registers(1, 1), outcomes.append, line.now)
+    gone = line.read(line.devices[0], registers(1, 1), lambda _: pytest.fail("it was cancelled"))
+    line.read(line.devices[0], registers(1, 1), outcomes.append)
     gone.cancel()
     line.run(1.0)
     assert len(outcomes) == 1
@@ -177,7 +177,7 @@ def test_a_cancelled_read_is_not_answered_and_does_not_disturb_the_others(virtua
 def test_an_outcome_is_never_handed_out_by_submit_itself(virtual_line: MakeLine) -> None:
     line = virtual_line(Registers(1), opened=False)
     outcomes: list[Outcome] = []
-    line.engine.submit(line.devices[0], registers(0, 1), outcomes.append, line.now)
+    line.read(line.devices[0], registers(0, 1), outcomes.append)
     assert outcomes == []
     line.run(0.1)
     assert len(outcomes) == 1
@@ -191,7 +191,7 @@ def test_a_face_that_fails_in_its_callback_does_not_stop_the_line(
     def broken(_outcome: Outcome) -> None:
         raise ValueError("a face's own mistake")
 
-    line.engine.submit(line.devices[0], registers(0, 1), broken, line.now)
+    line.read(line.devices[0], registers(0, 1), broken)
     line.run(2.0)
     assert "outcome_handler_failed" in caplog.text
     assert isinstance(line.ask(line.devices[0], registers(5, 1)), bytes)
@@ -226,7 +226,7 @@ def test_reads_that_wait_when_a_device_goes_offline_end_at_once(virtual_line: Ma
     line = virtual_line(dead, retries=0)
     outcomes: list[Outcome] = []
     for address in range(10):
-        line.engine.submit(line.devices[0], registers(address, 1), outcomes.append, line.now)
+        line.read(line.devices[0], registers(100 * address, 1), outcomes.append)
     line.run(3.0)
     assert len(outcomes) == 10
     assert sum(isinstance(outcome, DeviceOffline) for outcome in outcomes) >= 7
@@ -323,7 +323,7 @@ def test_a_line_that_goes_down_ends_what_waits_and_makes_its_devices_stale(virtu
     line.run(1.0)
     outcomes: list[Outcome] = []
     for address in (1, 2, 3):
-        line.engine.submit(line.devices[0], registers(address, 1), outcomes.append, line.now)
+        line.read(line.devices[0], registers(address, 1), outcomes.append)
     line.run(0.005)
     line.engine.closed("unplugged", line.now)
     line.run(0.1)
@@ -341,7 +341,7 @@ def test_a_full_queue_is_busy_at_once(virtual_line: MakeLine) -> None:
     line = virtual_line(Registers(1), queue_limit=3)
     outcomes: list[Outcome] = []
     for address in range(10):
-        line.engine.submit(line.devices[0], registers(address, 1), outcomes.append, line.now)
+        line.read(line.devices[0], registers(100 * address, 1), outcomes.append)
     line.run(5.0)
     assert sum(isinstance(outcome, QueueFull) for outcome in outcomes) == 7
     assert sum(isinstance(outcome, bytes) for outcome in outcomes) == 3
@@ -352,7 +352,7 @@ def test_a_read_that_waits_too_long_ends_as_busy(virtual_line: MakeLine) -> None
     line = virtual_line(slow, queue_limit_s=1.0)
     outcomes: list[Outcome] = []
     for address in range(20):
-        line.engine.submit(line.devices[0], registers(address, 1), outcomes.append, line.now)
+        line.read(line.devices[0], registers(100 * address, 1), outcomes.append)
     line.run(30.0)
     assert len(outcomes) == 20
     assert any(isinstance(outcome, QueueTimeout) for outcome in outcomes)
@@ -376,7 +376,7 @@ def test_polls_keep_their_period_while_a_client_asks_without_end(virtual_line: M
 
     def again(outcome: Outcome) -> None:
         done.append(outcome)
-        line.engine.submit(line.devices[0], registers(0x800 + len(done) % 1000, 20), again, line.now)
+        line.read(line.devices[0], registers(0x800 + len(done) % 1000, 20), again)
 
     again(b"")
     line.sent.clear()

@@ -1,4 +1,4 @@
-"""Whose turn it is: clients before polls, polls not starved, identical reads shared."""
+"""Whose turn it is: lanes by precedence, none of them starved, polls evenly late, quarantined devices probed only."""
 
 from __future__ import annotations
 
@@ -6,15 +6,20 @@ from random import Random
 
 import pytest
 
+from gateway.core.budget import read_s
 from gateway.core.health import Breaker
-from gateway.core.scheduler import ClientRead, PollItem, PollList, Purpose, Scheduler, Waiter
+from gateway.core.requests import ClientRead, Lane, PollItem, Purpose, ReadTurn, Span, Turn, Waiter, WriteTurn
+from gateway.core.scheduler import SLAVE_TURNS, PollList, Scheduler
+from gateway.core.settings import LineSettings
 from gateway.core.site import Device, Outcome
 from gateway.devices.model import PollClass, Space
 from gateway.devices.plan import PlannedBlock
 from gateway.devices.schema import load_map
 from gateway.errors import QueueFull
+from gateway.modbus.pdu import Function, ReadRequest
 
 LIVE = PlannedBlock(Space.REGISTERS, 0, 82, PollClass.LIVE)
+TIMING = LineSettings(name="line", index=1, port="virtual").timing()
 
 
 def device(unit_id: int) -> Device:
@@ -26,18 +31,52 @@ def polls(owner: Device, due: float = 0.0, period_s: float | None = 1.0) -> Poll
     return PollList(owner, Breaker(Random(1)), [item])
 
 
+def no_polls(owner: Device) -> PollList:
+    return PollList(owner, Breaker(Random(1)))
+
+
 def ignore(_outcome: Outcome) -> None:
     pass
 
 
 def scheduler(*lists: PollList, limit: int = 4, limit_s: float = 5.0) -> Scheduler:
-    return Scheduler(lists, limit=limit, limit_s=limit_s)
+    return Scheduler(
+        lists, limit=limit, limit_s=limit_s, cost=lambda space, count: read_s(TIMING, space, count), now=0.0
+    )
 
 
-def read(queue: Scheduler, owner: Device, pdu: bytes, now: float = 0.0) -> Waiter:
-    waiter = Waiter(ignore)
-    queue.add(owner, pdu, waiter, now)
+def read(
+    queue: Scheduler,
+    owner: Device,
+    first: int,
+    now: float = 0.0,
+    *,
+    count: int = 1,
+    client: str = "scada",
+    lane: Lane = Lane.CLIENT,
+) -> Waiter:
+    """Queue a read; addresses of 200 and more apart are never joined."""
+    waiter = Waiter(ignore, client, now)
+    request = ReadRequest(Function.READ_HOLDING_REGISTERS, first, count)
+    queue.add_read(owner, request.encode(), Span.of(owner, request), waiter, lane)
     return waiter
+
+
+def write(queue: Scheduler, owner: Device, lane: Lane, now: float = 0.0) -> WriteTurn:
+    turn = WriteTurn(owner, b"\x06\0\x25\0\0", lane, now, Waiter(ignore, "scada", now))
+    queue.add_write(turn)
+    return turn
+
+
+def lane_of(turn: Turn | None) -> str:
+    if isinstance(turn, PollItem):
+        return "poll"
+    return "none" if turn is None else turn.lane.name.lower()
+
+
+def reads_of(turn: Turn | None) -> tuple[ClientRead, ...]:
+    assert isinstance(turn, ReadTurn)
+    return turn.reads
 
 
 def run_poll(item: object, now: float) -> None:
@@ -47,28 +86,91 @@ def run_poll(item: object, now: float) -> None:
     item.due = now + item.period_s
 
 
-def test_a_client_goes_before_a_poll_that_is_due() -> None:
+def test_lanes_by_precedence() -> None:
     one = device(1)
     queue = scheduler(polls(one, due=0.0))
-    read(queue, one, b"a")
-    assert isinstance(queue.next(0.5), ClientRead)
-    assert isinstance(queue.next(0.5), PollItem)
+    read(queue, one, 0x8000, lane=Lane.BACKGROUND)
+    read(queue, one, 0)
+    write(queue, one, Lane.WRITE)
+    write(queue, one, Lane.SLAVE_CONTROL)
+    order = []
+    for _ in range(5):
+        turn = queue.next(0.1)
+        order.append(lane_of(turn))
+        if isinstance(turn, PollItem):
+            run_poll(turn, 0.1)
+    assert order == ["slave_control", "write", "client", "poll", "background"]
 
 
-def test_clients_that_never_stop_cannot_starve_a_poll() -> None:
+def test_clients_that_never_stop_cannot_starve_a_poll_nor_the_background() -> None:
     one = device(1)
-    queue = scheduler(polls(one, due=0.0))
+    queue = scheduler(polls(one, due=0.0), limit=400)
+    read(queue, one, 0x8000, lane=Lane.BACKGROUND)
     turns = []
-    for step in range(20):
-        now = 5.0 + step * 0.2
-        read(queue, one, bytes([step]), now)
-        job = queue.next(now)
-        turns.append(type(job).__name__)
-        if isinstance(job, PollItem):
-            run_poll(job, now)
-    assert turns.count("PollItem") >= 2
-    assert turns.count("ClientRead") >= 15
-    assert "PollItem" in turns[:2]
+    for step in range(400):
+        now = 5.0 + step * 0.25
+        read(queue, one, 160 * step, now)
+        turn = queue.next(now)
+        turns.append(lane_of(turn))
+        if isinstance(turn, PollItem):
+            run_poll(turn, now)
+        if turn is not None and lane_of(turn) == "background":
+            read(queue, one, 0x8000, now, lane=Lane.BACKGROUND)
+    assert "poll" in turns[:2]
+    assert turns.count("poll") > 40
+    assert turns.count("client") > 300
+    assert 2 <= turns.count("background") <= 4  # once in thirty seconds
+
+
+def test_writes_that_never_stop_cannot_starve_the_clients() -> None:
+    one = device(1)
+    queue = scheduler(no_polls(one))
+    read(queue, one, 0)
+    order = []
+    for step in range(8):
+        now = 2.0 + 0.1 * step
+        write(queue, one, Lane.WRITE, now)
+        order.append(lane_of(queue.next(now)))
+    assert order.count("client") == 1
+    assert order.index("client") <= 1
+
+
+def test_slave_control_goes_ahead_of_everything_for_a_while_but_not_for_ever() -> None:
+    one = device(1)
+    queue = scheduler(no_polls(one))
+    read(queue, one, 0)
+    order = []
+    for step in range(10):
+        now = 2.0 + 0.1 * step
+        write(queue, one, Lane.SLAVE_CONTROL, now)
+        order.append(lane_of(queue.next(now)))
+    assert order[:SLAVE_TURNS] == ["slave_control"] * SLAVE_TURNS
+    assert order.count("client") == 1
+
+
+def test_a_background_read_waits_until_it_is_over_before_the_next_poll() -> None:
+    one = device(1)
+    queue = scheduler(polls(one, due=1.0))
+    read(queue, one, 0x8000, now=0.0, count=112, lane=Lane.BACKGROUND)
+    assert queue.next(0.9) is None
+    assert queue.next_due(0.9) == 1.0
+    run_poll(queue.next(1.0), 1.0)
+    assert queue.next_due(1.25) == 1.25
+    assert lane_of(queue.next(1.25)) == "background"
+
+
+def test_a_background_read_that_waited_half_a_minute_is_made_all_the_same() -> None:
+    one = device(1)
+    queue = scheduler(polls(one, due=0.0, period_s=0.2))
+    read(queue, one, 0x8000, now=0.0, count=112, lane=Lane.BACKGROUND)
+    lanes = []
+    for step in range(400):
+        turn = queue.next(0.1 * step)
+        lanes.append(lane_of(turn))
+        if isinstance(turn, PollItem):
+            run_poll(turn, 0.1 * step)
+    assert lanes.count("background") == 1
+    assert lanes.index("background") >= 300
 
 
 def test_on_a_line_too_slow_all_periods_stretch_alike() -> None:
@@ -95,13 +197,12 @@ def test_after_a_pause_there_is_one_round_and_no_burst() -> None:
 
 def test_identical_reads_are_one_read_with_two_waiters() -> None:
     one, two = device(1), device(2)
-    queue = scheduler()
-    read(queue, one, b"a")
-    read(queue, one, b"a")
-    read(queue, two, b"a")
+    queue = scheduler(no_polls(one), no_polls(two))
+    read(queue, one, 0)
+    read(queue, one, 0)
+    read(queue, two, 0)
     assert len(queue) == 2
-    first = queue.next(0.0)
-    assert isinstance(first, ClientRead)
+    (first,) = reads_of(queue.next(0.0))
     assert first.device is one
     assert len(first.waiters) == 2
 
@@ -109,66 +210,95 @@ def test_identical_reads_are_one_read_with_two_waiters() -> None:
 def test_a_read_that_started_takes_no_new_waiter() -> None:
     """A read that is on the wire began before the second was asked: its value may be older than the question."""
     one = device(1)
-    queue = scheduler()
-    read(queue, one, b"a")
-    started = queue.next(0.0)
-    read(queue, one, b"a")
-    assert isinstance(started, ClientRead)
+    queue = scheduler(no_polls(one))
+    read(queue, one, 0)
+    (started,) = reads_of(queue.next(0.0))
+    read(queue, one, 0)
     assert len(started.waiters) == 1
+    assert len(queue) == 1
+
+
+def test_neighbouring_reads_are_one_transaction() -> None:
+    one, two = device(1), device(2)
+    queue = scheduler(no_polls(one), no_polls(two))
+    read(queue, one, 0x10)
+    read(queue, two, 0x11)
+    read(queue, one, 0x12)
+    turn = queue.next(0.0)
+    assert isinstance(turn, ReadTurn)
+    assert turn.pdu == ReadRequest(Function.READ_HOLDING_REGISTERS, 0x10, 3).encode()
+    assert [one_read.device for one_read in turn.reads] == [one, one]
     assert len(queue) == 1
 
 
 def test_one_waiter_leaving_takes_nothing_from_the_other() -> None:
     one = device(1)
-    queue = scheduler()
-    first = read(queue, one, b"a")
-    read(queue, one, b"a")
+    queue = scheduler(no_polls(one))
+    first = read(queue, one, 0)
+    read(queue, one, 0)
     first.cancel()
-    assert isinstance(queue.next(0.0), ClientRead)
+    assert len(reads_of(queue.next(0.0))) == 1
 
 
 def test_a_read_that_nobody_wants_any_more_costs_no_line_time() -> None:
     one = device(1)
-    queue = scheduler()
-    read(queue, one, b"a").cancel()
+    queue = scheduler(no_polls(one))
+    read(queue, one, 0).cancel()
     assert queue.next_due(0.0) is None
     assert queue.next(0.0) is None
     assert len(queue) == 0
 
 
+def test_a_write_whose_client_left_is_not_made() -> None:
+    one = device(1)
+    queue = scheduler(no_polls(one))
+    write(queue, one, Lane.WRITE).waiter.cancel()
+    assert queue.next_due(0.0) is None
+    assert queue.next(0.0) is None
+
+
 def test_a_full_queue_refuses_but_an_identical_read_may_join_and_the_unwanted_make_room() -> None:
     one = device(1)
-    queue = scheduler(limit=2)
-    first = read(queue, one, b"a")
-    read(queue, one, b"b")
+    queue = scheduler(no_polls(one), limit=2)
+    first = read(queue, one, 0)
+    read(queue, one, 200)
     with pytest.raises(QueueFull):
-        read(queue, one, b"c")
-    read(queue, one, b"b")
+        read(queue, one, 400)
+    read(queue, one, 200)
     first.cancel()
-    read(queue, one, b"c")
+    read(queue, one, 400)
     assert len(queue) == 2
+
+
+def test_a_full_queue_of_writes_refuses() -> None:
+    one = device(1)
+    queue = scheduler(no_polls(one), limit=2)
+    write(queue, one, Lane.WRITE)
+    write(queue, one, Lane.WRITE)
+    with pytest.raises(QueueFull):
+        write(queue, one, Lane.WRITE)
 
 
 def test_a_read_that_waited_too_long_is_given_up() -> None:
     one = device(1)
-    queue = scheduler(limit_s=5.0)
-    read(queue, one, b"a", now=0.0)
-    read(queue, one, b"b", now=3.0)
+    queue = scheduler(no_polls(one), limit_s=5.0)
+    first = read(queue, one, 0, now=0.0)
+    read(queue, one, 200, now=3.0)
     assert queue.next_expiry() == 5.0
     assert queue.expired(4.9) == []
-    assert [waiting.pdu for waiting in queue.expired(5.0)] == [b"a"]
+    assert queue.expired(5.0) == [first]
     assert len(queue) == 1
+    assert queue.next_expiry() == 8.0
 
 
 def test_a_retry_goes_first() -> None:
     one = device(1)
-    queue = scheduler()
-    read(queue, one, b"a")
-    started = queue.next(0.0)
-    read(queue, one, b"b")
-    assert isinstance(started, ClientRead)
+    queue = scheduler(no_polls(one))
+    read(queue, one, 0)
+    (started,) = reads_of(queue.next(0.0))
+    read(queue, one, 200)
     queue.retry(started)
-    assert queue.next(0.0) is started
+    assert reads_of(queue.next(0.0)) == (started,)
 
 
 def test_a_quarantined_device_is_asked_only_when_its_probe_is_due() -> None:
@@ -177,23 +307,23 @@ def test_a_quarantined_device_is_asked_only_when_its_probe_is_due() -> None:
     queue = scheduler(dead, polls(two, due=0.5))
     for _ in range(3):
         dead.breaker.missed(0.0)
-    job = queue.next(1.0)
-    assert isinstance(job, PollItem)
-    assert job.device is two
-    run_poll(job, 1.0)
+    turn = queue.next(1.0)
+    assert turn is not None
+    assert turn.device is two
+    run_poll(turn, 1.0)
     assert queue.next(1.5) is None
     assert dead.breaker.probe_at is not None
+    run_poll(queue.next(2.5), 100.0)
     probe = queue.next(dead.breaker.probe_at)
-    run_poll(queue.next(9.0), 9.0)
-    assert isinstance(probe, PollItem)
+    assert probe is not None
+    assert probe.device is one
 
 
-def test_the_reads_of_a_quarantined_device_can_be_taken_out() -> None:
+def test_the_requests_of_a_quarantined_device_can_be_taken_out() -> None:
     one, two = device(1), device(2)
-    queue = scheduler()
-    read(queue, one, b"a")
-    read(queue, two, b"a")
-    read(queue, one, b"b")
-    assert [taken.pdu for taken in queue.take_device(one)] == [b"a", b"b"]
-    assert [taken.device for taken in queue.drain()] == [two]
+    queue = scheduler(no_polls(one), no_polls(two))
+    mine = [read(queue, one, 0), read(queue, one, 200), write(queue, one, Lane.WRITE).waiter]
+    other = read(queue, two, 0)
+    assert queue.drain(one) == mine
+    assert queue.drain() == [other]
     assert len(queue) == 0

@@ -8,6 +8,7 @@ from random import Random
 from typing import Any
 
 from gateway.core.engine import LineEngine
+from gateway.core.requests import Lane, Waiter
 from gateway.core.settings import LineSettings
 from gateway.core.site import Device, Outcome
 from gateway.devices.schema import load_map
@@ -43,10 +44,20 @@ class VirtualLine:
                 self.engine.receive(data, self.now)
             self.engine.on_timer(self.now)
 
+    def read(
+        self, device: Device, pdu: bytes, done: Callable[[Outcome], None], client: str = "", lane: Lane = Lane.CLIENT
+    ) -> Waiter:
+        """Read as a client does."""
+        return self.engine.read(device, pdu, done, self.now, client=client, lane=lane)
+
+    def write(self, device: Device, pdu: bytes, done: Callable[[Outcome], None], client: str = "") -> Waiter:
+        """Write as a client does."""
+        return self.engine.write(device, pdu, done, self.now, client=client)
+
     def ask(self, device: Device, pdu: bytes, wait_s: float = 10.0) -> Outcome:
         """Read as a client does and wait for the outcome."""
         outcomes: list[Outcome] = []
-        self.engine.submit(device, pdu, outcomes.append, self.now)
+        self.read(device, pdu, outcomes.append)
         end = self.now + wait_s
         while not outcomes and self.now < end:
             self.run(0.01)

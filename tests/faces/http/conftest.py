@@ -57,8 +57,11 @@ class UnreadableLine:
     def status(self, now: float) -> LineStatus:
         return LineStatus(self.state, 0.0, self.error, queue_depth=2, use_ratio=0.25)
 
-    def read(self, device: object, pdu: bytes, done: object) -> NoReturn:
+    def read(self, device: object, pdu: bytes, done: object, *, client: str = "", background: bool = False) -> NoReturn:
         pytest.fail("the HTTP face read a line")
+
+    def write(self, device: object, pdu: bytes, done: object, *, client: str = "") -> NoReturn:
+        pytest.fail("the HTTP face wrote")
 
 
 def make_point(name: str, metric: str | None, **changes: object) -> Point:

@@ -113,7 +113,12 @@ class FakeLine:
         state = LineState.OPEN if self.open else LineState.DOWN
         return LineStatus(state, now, "" if self.open else "unplugged", len(self.waiting), 0.0)
 
-    def read(self, device: Device, pdu: bytes, done: Callable[[Outcome], None]) -> FakeTicket:
+    def write(self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "") -> FakeTicket:
+        return self.read(device, pdu, done, client=client)
+
+    def read(
+        self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "", background: bool = False
+    ) -> FakeTicket:
         ticket = FakeTicket(done)
         for read in self.waiting:
             if read.device is device and read.pdu == pdu:

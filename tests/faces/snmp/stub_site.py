@@ -44,8 +44,13 @@ class StubLine:
         error = "" if self.state is LineState.OPEN else "no such device"
         return LineStatus(self.state, NOW + 5.0, error, 3, 0.75)
 
-    def read(self, device: Device, pdu: bytes, done: Callable[[Outcome], None]) -> Ticket:
+    def read(
+        self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "", background: bool = False
+    ) -> Ticket:
         raise AssertionError("the SNMP face asked a line")
+
+    def write(self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "") -> Ticket:
+        raise AssertionError("the SNMP face wrote")
 
 
 def values_of(device_map: DeviceMap, unit_id: int) -> dict[str, Value]:

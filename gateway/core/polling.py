@@ -1,0 +1,217 @@
+"""What is polled of a device, and what the replies say about its state.
+
+Rule 1: live blocks as often as asked (at night more seldom, where configured), settings seldom; who the device is
+        once after each start. The line decides what is possible (scheduler.py).
+Rule 2: a block refused with exception 02 or 03 is split in two, and the split is remembered.
+Rule 3: a device is online once each of its live blocks was read since the line was opened or the device came back
+        and it proved to be the unit that is expected there (identity.py), and while no live block was missed
+        three times in a row. It is stale when one was, or when the line is down; offline from the moment its
+        breaker opens until it is online again.
+Rule 4: a unit that is not the expected one is not shown and not asked for anybody; it is looked at again
+        every minute.
+Rule 5: a value that must be written again and again is warned about after three quarters of its time.
+        It is never written by the gateway itself.
+"""
+
+from __future__ import annotations
+
+import logging
+
+from gateway.core.device_record import DeviceRecord
+from gateway.core.health import MISSES_TO_OPEN
+from gateway.core.requests import PollItem, Purpose
+from gateway.core.settings import LineSettings
+from gateway.core.site import Device
+from gateway.core.snapshot import Block, DeviceState
+from gateway.devices.model import Identification, PollClass, Space
+from gateway.devices.plan import PlannedBlock, poll_plan, split
+from gateway.modbus.pdu import ReadRequest, parse_identification, read_identification_request
+from gateway.modbus.rtu import Replied
+
+log = logging.getLogger(__name__)
+
+LOOK_AGAIN_S = 60.0
+REWRITE_WARNING_SHARE = 0.75
+IDENTITY_MISMATCH = "identity_mismatch"
+NOT_REWRITTEN = "slave_control_not_refreshed"
+_REFUSALS_TO_SPLIT = (0x02, 0x03)
+_SMOOTHING = 0.3
+
+
+class Polling:
+    """The polls of one line's devices."""
+
+    def __init__(self, settings: LineSettings) -> None:
+        self._settings = settings
+
+    def first(self, device: Device, now: float) -> list[PollItem]:
+        """The plan, and what is asked once."""
+        poll = self._settings.poll
+        period_s = {PollClass.LIVE: poll.live_s, PollClass.SETTINGS: poll.settings_s}
+        blocks = [_poll_item(device, block, period_s[block.poll], now) for block in poll_plan(device.map)]
+        return sorted(blocks + self._once(device, now), key=_rank)
+
+    def restart(self, record: DeviceRecord, now: float) -> None:
+        """Everything is read anew; blocks that were split stay split."""
+        record.restart()
+        items = [item for item in record.polls.items if item.block is not None]
+        for item in items:
+            item.restart(now)
+        record.polls.items = sorted(items + self._once(record.device, now), key=_rank)
+
+    def started(self, item: PollItem, record: DeviceRecord, now: float) -> None:
+        """A poll goes out: set when it is due again."""
+        if item.period_s is None:
+            return
+        period_s = item.period_s
+        if item.block is not None and item.block.poll is PollClass.LIVE:
+            if record.night and self._settings.poll.night_s is not None:
+                period_s = max(period_s, self._settings.poll.night_s)
+            if record.live_started_at is not None and item is _first_live(record):
+                stats = record.device.stats
+                took_s = now - record.live_started_at
+                stats.refresh_s = (
+                    took_s if stats.refresh_s is None else (stats.refresh_s + _SMOOTHING * (took_s - stats.refresh_s))
+                )
+            if item is _first_live(record):
+                record.live_started_at = now
+        if IDENTITY_MISMATCH in record.device.snapshot.warnings:
+            period_s = max(period_s, LOOK_AGAIN_S)
+        item.due = now + period_s
+
+    def replied(self, item: PollItem, record: DeviceRecord, event: Replied, now: float) -> None:
+        """A poll brought data."""
+        item.misses = 0
+        if item.block is not None:
+            block = item.block
+            item.fresh = True
+            record.store(Block(block.space, block.first, block.count, event.pdu[2:], event.sent_at), now)
+        elif item.purpose is Purpose.IDENTIFY:
+            record.polls.items.remove(item)
+            objects = parse_identification(event.pdu).objects
+            texts = (objects.get(number, b"").decode("ascii", "replace").strip("\0 ") for number in range(3))
+            record.identified(Identification(*texts), now)
+        else:
+            record.polls.items.remove(item)
+            record.numbered(_printable(event.pdu[2:]), now)
+
+    def refused(self, item: PollItem, record: DeviceRecord, code: int, now: float) -> None:
+        """The device answered a poll with an exception (rule 2)."""
+        record.heard(now)
+        block = item.block
+        if block is None:
+            record.polls.items.remove(item)  # the device does not have it: asked once, no failure
+            return
+        item.misses += 1
+        item.device.stats.failures += 1
+        if code not in _REFUSALS_TO_SPLIT or item.period_s is None:
+            return
+        record.polls.items.remove(item)
+        record.polls.refused(block.space, block.count)
+        record.forget(block.space, block.first, block.last + 1)
+        halves = split(block, item.device.map)
+        log.info(
+            "event=block_refused device=%s space=%s first=0x%04X count=%d exception=%02X action=%s",
+            item.device.name,
+            block.space,
+            block.first,
+            block.count,
+            code,
+            "dropped" if halves is None else "split",
+        )
+        if halves is not None:
+            record.polls.items += [_poll_item(item.device, half, item.period_s, now) for half in halves]
+
+    def failed(self, item: PollItem, record: DeviceRecord, now: float) -> None:
+        """A poll brought nothing."""
+        item.misses += 1
+        if item.period_s is None:
+            item.due = now + self._settings.poll.live_s
+            if item.misses >= MISSES_TO_OPEN or item.optional:
+                record.polls.items.remove(item)  # tried, never insisted on
+
+    def wanted_again(self, record: DeviceRecord, space: Space, address: int, now: float) -> None:
+        """An address was written: its old value is forgotten and its block is read next."""
+        for item in record.polls.items:
+            block = item.block
+            if block is not None and block.space is space and block.first <= address <= block.last:
+                record.forget(space, block.first, block.last + 1)
+                item.due = now
+
+    def judge(self, record: DeviceRecord) -> DeviceState:
+        """The state that follows (rule 3); the caller publishes it."""
+        live = [item for item in record.polls.items if item.block is not None and item.block.poll is PollClass.LIVE]
+        if record.breaker.is_open:
+            return DeviceState.OFFLINE
+        complete = bool(live) and all(item.fresh and item.misses == 0 for item in live)
+        if record.state is DeviceState.ONLINE:
+            if any(item.misses >= MISSES_TO_OPEN for item in live):
+                return DeviceState.STALE
+            if complete:
+                record.known = record.known.learned(record.seen())
+            return DeviceState.ONLINE
+        asking = any(item.block is None for item in record.polls.items)
+        if not complete or asking or not self._verify(record):
+            return record.state
+        return DeviceState.ONLINE
+
+    def watch_rewrites(self, record: DeviceRecord, now: float) -> None:
+        """Raise or clear the warning of rule 5."""
+        late = False
+        for name, written_at in record.rewrites.items():
+            rewrite_s = record.device.map.point(name).rewrite_s
+            late = late or (rewrite_s is not None and now - written_at >= REWRITE_WARNING_SHARE * rewrite_s)
+        if record.warn(NOT_REWRITTEN, on=late):
+            log.warning("event=%s device=%s on=%s", NOT_REWRITTEN, record.device.name, str(late).lower())
+
+    def next_warning(self, record: DeviceRecord) -> float | None:
+        """When `watch_rewrites` has something to raise."""
+        if not record.rewrites or NOT_REWRITTEN in record.device.snapshot.warnings:
+            return None
+        points = {name: record.device.map.point(name) for name in record.rewrites}
+        return min(at + REWRITE_WARNING_SHARE * (points[name].rewrite_s or 0.0) for name, at in record.rewrites.items())
+
+    def _verify(self, record: DeviceRecord) -> bool:
+        """Rule 4."""
+        complaint = record.known.complaint(record.seen(), record.device.map.identity.growing)
+        if record.warn(IDENTITY_MISMATCH, on=complaint is not None):
+            if complaint is not None:
+                record.device.stats.identity_mismatches += 1
+                log.error('event=identity_mismatch device=%s reason="%s"', record.device.name, complaint)
+            else:
+                log.info("event=identity_restored device=%s", record.device.name)
+        record.verified = complaint is None
+        if complaint is None:
+            record.known = record.known.learned(record.seen())
+        return record.verified
+
+    def _once(self, device: Device, now: float) -> list[PollItem]:
+        """What is asked once after each start: who are you."""
+        items = [PollItem(device, Purpose.IDENTIFY, read_identification_request(), None, None, now)]
+        if device.map.identity.serial_first is not None:
+            function = device.map.read_function(Space.REGISTERS)
+            request = ReadRequest(function, device.map.identity.serial_first, device.map.identity.serial_words)
+            items.append(PollItem(device, Purpose.SERIAL_NUMBER, request.encode(), None, None, now))
+        return items
+
+
+def _first_live(record: DeviceRecord) -> PollItem | None:
+    return next((i for i in record.polls.items if i.block is not None and i.block.poll is PollClass.LIVE), None)
+
+
+def _poll_item(device: Device, block: PlannedBlock, period_s: float, due: float) -> PollItem:
+    request = ReadRequest(device.map.read_function(block.space), block.first, block.count)
+    return PollItem(device, Purpose.POLL, request.encode(), block, period_s, due)
+
+
+def _rank(item: PollItem) -> int:
+    """Order of the first round: what is shown first, then what proves whose values they are, then the rest."""
+    if item.block is None:
+        return 1
+    return 0 if item.block.poll is PollClass.LIVE else 2
+
+
+def _printable(words: bytes) -> str:
+    """Registers as ASCII text; "" when they hold anything else (the number is undocumented)."""
+    text = words.strip(b"\0\xff ")
+    return text.decode("ascii") if text.isascii() and text.decode("ascii", "replace").isprintable() else ""
