@@ -270,8 +270,41 @@ async def test_a_request_that_nobody_answers_ends_its_connection(running: Runnin
     await running.until(lambda: len(running.world.line(12).waiting) == 1)
     running.world.clock.now += 60.1
     running.server.sweep()
+    running.world.line(12).release()  # too late, and before the transport has told anybody that it is closed
     assert await client.rest() == b""
     assert running.world.stats.closed == {"unanswered": 1}
+
+
+async def test_a_flood_of_refusals_is_answered_in_turns(running: Running) -> None:
+    count = 5000  # far more than one turn; one write, so that few reads take it
+    client = await running.connect()
+    client.send(b"".join(mbap.encode(tid, 12, b"\x08\0\0\0\0") for tid in range(count)))
+    replies = await client.adus(count)
+    assert replies == [mbap.Adu(tid, 12, b"\x88\x01") for tid in range(count)]
+
+
+async def test_a_flooding_client_that_vanishes_between_two_turns(running: Running) -> None:
+    world = running.world
+    client, other = await running.connect(), await running.connect()
+    client.send(mbap.encode(1, 12, b"\x08\0\0\0\0") * 20_000)
+    await running.until(lambda: world.stats.requests > 0)
+    client.reset()
+    assert await other.query(12, READ_1) == GOOD_REPLY[7:]
+    await running.until(lambda: world.stats.open_connections == 1)
+
+
+async def test_an_error_while_a_reply_comes_ends_only_its_connection(
+    running: Running, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = running.world
+    client, other = await running.connect(), await running.connect()
+    with monkeypatch.context() as patch:
+        patch.setattr(running.server.dispatcher, "conclude", lambda *args: 1 / 0)
+        client.send(GOOD)
+        assert await client.rest() == b""
+    assert await other.query(12, READ_1) == GOOD_REPLY[7:]
+    assert world.stats.closed.pop("error") == 1
+    assert "ZeroDivisionError" in caplog.text
 
 
 async def test_an_error_nobody_foresaw_ends_only_its_connection(
