@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import signal
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -77,11 +78,25 @@ async def _run(site: SimulatedSite, as_json: bool) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopped.set)
     site.open()
+    opened_at = loop.time()
     try:
         _announce(site, as_json)
         await stopped.wait()
     finally:
         site.close()
+    _sum_up(site, loop.time() - opened_at)
+
+
+def _sum_up(site: SimulatedSite, elapsed_s: float) -> None:
+    """Tell on standard error what each line saw; a gap violation is a client that waited less than 3.5 characters."""
+    for plan, port in zip(site.plans, site.lines, strict=True):
+        seen = port.line.counters
+        print(
+            f"line={plan.name} requests={seen.requests} replies={seen.replies} bad_frames={seen.bad_frames}"
+            f" gap_violations={seen.gap_violations} collisions={seen.collisions}"
+            f" shortest_gap_ms={seen.shortest_gap_s * 1000:.2f} use={port.line.use_ratio(elapsed_s):.1%}",
+            file=sys.stderr,
+        )
 
 
 def _announce(site: SimulatedSite, as_json: bool) -> None:

@@ -125,6 +125,14 @@ class SimulatedLine:
         """Send the next reply that much later; calls add up to one delay a reply."""
         self._delays.append(seconds)
 
+    def clear(self) -> None:
+        """Forget all that is on its way, in both directions: the client's adapter was away."""
+        self._frame.clear()
+        self._pending.clear()
+        self._wire.clear()
+        self._busy_until.clear()
+        self._in_end = self._out_end = -math.inf
+
     def use_ratio(self, elapsed_s: float) -> float:
         """Share of `elapsed_s` in which the wire carried bytes or the gaps they need."""
         return (self.counters.busy_s + self.counters.gaps_s) / elapsed_s if elapsed_s > 0 else 0.0

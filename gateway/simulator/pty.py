@@ -61,13 +61,19 @@ class PtyLine:
         """Make a pty, let the link lead to it, begin to listen; OSError when the system refuses."""
         if self._master is not None:
             return
-        self._master, self._slave = os.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self._device = os.ttyname(self._slave)
-        if self.link is not None:
-            _move_link(self.link, self._device)
-        asyncio.get_running_loop().add_reader(self._master, self._readable)
+        master, slave = os.openpty()
+        try:
+            tty.setraw(slave)
+            os.set_blocking(master, False)
+            device = os.ttyname(slave)
+            if self.link is not None:
+                _move_link(self.link, device)
+        except OSError:
+            os.close(master)
+            os.close(slave)
+            raise
+        self._master, self._slave, self._device = master, slave, device
+        asyncio.get_running_loop().add_reader(master, self._readable)
 
     def close(self) -> None:
         """End: the client's file descriptor hangs up and the link goes."""
@@ -90,7 +96,7 @@ class PtyLine:
     def replug(self) -> None:
         """Plug the adapter in again: a new pty, usually under another name, and the link moved to it."""
         self.unplug()
-        self.line.take(self._clock.monotonic())  # what was on its way while unplugged reached nobody
+        self.line.clear()
         self.open()
 
     async def __aenter__(self) -> Self:
@@ -133,7 +139,9 @@ class PtyLine:
 
 
 def _move_link(link: Path, target: str) -> None:
-    """Let `link` lead to `target` in one step, so that it never leads nowhere in between."""
+    """Let `link` lead to `target` in one step, never nowhere in between; FileExistsError when a file is there."""
+    if link.exists() and not link.is_symlink():
+        raise FileExistsError(f"{link} is there already and is no symlink")
     fresh = link.with_name(f".{link.name}.{os.getpid()}")
     fresh.unlink(missing_ok=True)
     fresh.symlink_to(target)

@@ -41,7 +41,7 @@ def seconds(unit: SimulatedController, until: float, step: float = 10.0) -> Iter
 def test_the_numbers_of_every_moment_hang_together(make: Make, seed: int) -> None:
     unit = make(seed=seed)
     points = unit.day.points
-    for _ in seconds(unit, 3 * DAY):
+    for _ in seconds(unit, 2 * DAY, 20.0):
         now = unit.day.now
         assert now.net_a == pytest.approx(now.charge_a - now.load_a)
         assert now.output_w == pytest.approx(now.charge_a * now.battery_v)
@@ -171,7 +171,7 @@ def test_every_enumeration_value_has_a_name(make: Make, prostar_map: DeviceMap, 
         for point in prostar_map.points
         if point.enumeration is not None and point.space is Space.REGISTERS
     }
-    for _ in seconds(unit, 2 * DAY, 60.0):
+    for _ in seconds(unit, 2 * DAY, 300.0):
         for name, numbers in named.items():
             assert unit.memory.get(name) in numbers
 

@@ -196,6 +196,17 @@ def test_a_medium_can_echo_and_drop(oracle: OracleController) -> None:
     assert line.counters.requests == 0
 
 
+def test_clearing_forgets_both_directions(line: SimulatedLine) -> None:
+    line.receive(read(1), 0.0)
+    line.take(0.1)
+    line.receive(read(1)[:4], 0.1)
+    line.clear()
+    assert line.next_event() is None
+    collisions = line.counters.collisions
+    assert crc_ok(reply_of(line, read(1), 0.11)[0])
+    assert line.counters.collisions == collisions
+
+
 def test_line_use_counts_bytes_and_their_gaps(prostar_map: DeviceMap) -> None:
     line = SimulatedLine([OracleController(prostar_map, turnaround_s=0.0)])
     now = 0.0
