@@ -9,7 +9,7 @@ import typer
 from gateway.cli.config_file import ConfigOption, load_or_exit
 from gateway.service.gateway import serve
 from gateway.service.logs import Level, set_up_logging
-from gateway.service.loops import Loop
+from gateway.service.loops import Loop, loop_factory
 
 
 def command(
@@ -20,5 +20,9 @@ def command(
     loop: Annotated[Loop, typer.Option(help="The event loop; auto takes uvloop where it is installed.")] = Loop.AUTO,
 ) -> None:
     """Read the lines and serve the three faces until SIGTERM or Ctrl-C; exit status 78 for a bad configuration."""
+    try:
+        make_loop = loop_factory(loop)
+    except ValueError as error:
+        raise typer.BadParameter(str(error), param_hint="--loop") from None
     set_up_logging(log_level)
-    serve(load_or_exit(config), loop)
+    serve(load_or_exit(config), make_loop)

@@ -24,7 +24,6 @@ from gateway.faces.snmp.agent import SnmpAgent
 from gateway.lines.serial import SerialLine
 from gateway.service.advice import advice
 from gateway.service.config import Config
-from gateway.service.loops import Loop, loop_factory
 from gateway.service.settings import (
     http_settings,
     line_budgets,
@@ -71,9 +70,9 @@ class Gateway:
         await self.supervisor.run(stop)
 
 
-def serve(config: Config, loop: Loop = Loop.AUTO) -> None:
+def serve(config: Config, make_loop: Callable[[], asyncio.AbstractEventLoop]) -> None:
     """Run the gateway until a signal stops it."""
-    with asyncio.Runner(loop_factory=loop_factory(loop)) as runner:
+    with asyncio.Runner(loop_factory=make_loop) as runner:
         runner.run(_serve(config))
 
 

@@ -17,13 +17,13 @@ class Loop(StrEnum):
 
 
 def loop_factory(choice: Loop) -> Callable[[], asyncio.AbstractEventLoop]:
-    """What makes the loop; ImportError when uvloop was asked for by name and is not installed."""
+    """What makes the loop; ValueError when uvloop was asked for by name and is not installed."""
     if choice is Loop.ASYNCIO:
         return asyncio.new_event_loop
     try:
         factory: Callable[[], asyncio.AbstractEventLoop] = importlib.import_module("uvloop").new_event_loop
     except ImportError:
         if choice is Loop.UVLOOP:
-            raise
+            raise ValueError("uvloop is not installed") from None
         return asyncio.new_event_loop
     return factory

@@ -235,7 +235,7 @@ class CommunityTable(Table):
     """`[[snmp.community]]`: who may read by SNMP v2c; none by default."""
 
     name: Annotated[
-        Annotated[str, Field(pattern=r"^[!-~]{1,32}$")],
+        Annotated[str, Field(pattern=r"^[!-~]{1,32}$", repr=False)],
         Key("1 to 32 printable ASCII characters without blanks", "The community name.", secret=True),
     ]
     source: Annotated[Networks, Key(_NETWORK + ", at least one", "From where it may be used.")] = Field(min_length=1)

@@ -1,0 +1,78 @@
+"""Advice: what is allowed and yet worth a second look, and nothing about a file that is as it should be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gateway.service.advice import advice
+from gateway.service.config import parse_config
+from gateway.service.settings import line_budgets
+
+HEAD = 'site = "ridge-07"\n'
+DEVICE = '[[line.device]]\nname = "d{n}"\naddress = {n}\nunit_id = {n}\nmodel = "prostar-mppt"\n'
+LINE = '[[line]]\nname = "shelter-a"\nport = "/dev/serial/by-id/usb-a"\n' + DEVICE.format(n=1)
+COMMUNITY = '[[snmp.community]]\nname = "k7-reader"\nsource = ["127.0.0.0/8"]\n'
+OWN_ROOT = '[snmp]\nenterprise_root = "1.3.6.1.4.1.12345.1"\n'
+CLEAN = HEAD + LINE + OWN_ROOT + COMMUNITY
+
+
+def advised(text: str) -> tuple[str, ...]:
+    config = parse_config(text)
+    return advice(config, line_budgets(config))
+
+
+def test_a_file_that_is_as_it_should_be_needs_none() -> None:
+    assert advised(CLEAN) == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (HEAD + LINE + COMMUNITY, "snmp.enterprise_root: 32473 is the number for documentation"),
+        (HEAD + LINE, "snmp.community: there is none, so nobody can read by SNMP and the port is not opened"),
+        (CLEAN.replace("/dev/serial/by-id/usb-a", "/dev/ttyUSB0"), "line[0].port: /dev/ttyUSB0 may be another adapter"),
+        (CLEAN.replace("/dev/serial/by-id/usb-a", "/dev/ttyACM0"), "line[0].port: /dev/ttyACM0 may be another adapter"),
+        (
+            CLEAN + '[modbus]\nlisten = ["0.0.0.0:1502"]\nallow = ["10.0.0.0/8"]\n',
+            "modbus.listen[0]: 0.0.0.0:1502 can be reached from other machines, and Modbus TCP has no password",
+        ),
+        (CLEAN + '[modbus]\nlisten = ["0.0.0.0:1502"]\n', "modbus.allow: only this machine may connect"),
+        (CLEAN + '[modbus]\nallow = ["::/0"]\n', "modbus.allow[0]: ::/0 is everybody"),
+        (CLEAN + "[modbus]\nallow = []\n", "modbus.allow: is empty, so nobody may connect"),
+        (CLEAN + '[http]\nlisten = ["[::]:9850"]\n', "http.listen[0]: [::]:9850 can be reached from other machines"),
+        (
+            CLEAN.replace("[snmp]\n", '[snmp]\nlisten = ["192.0.2.1:161"]\n'),
+            "snmp.listen[0]: 192.0.2.1:161 can be reached from other machines, and SNMP v2c sends the community in",
+        ),
+        (CLEAN.replace("127.0.0.0/8", "0.0.0.0/0"), "snmp.community[0].source[0]: 0.0.0.0/0 is everybody"),
+        (
+            CLEAN.replace("127.0.0.0/8", "10.0.0.0/8").replace("k7-reader", "public"),
+            "snmp.community[0].name: is one that everybody tries first",
+        ),
+        (CLEAN + "[cache]\nmax_age_s = 0.5\n", "line[0]: live values come every 1.0 s, which is not within cache.max"),
+        (
+            HEAD + LINE + "".join(DEVICE.format(n=n) for n in range(2, 9)) + OWN_ROOT + COMMUNITY,
+            "% of the line, so live values come every 2.",
+        ),
+    ],
+)
+def test_what_deserves_a_second_look(text: str, expected: str) -> None:
+    found = advised(text)
+    assert any(expected in each for each in found), found
+
+
+def test_two_names_of_one_port_are_noticed(tmp_path: Path) -> None:
+    real, link = tmp_path / "ttyS0", tmp_path / "by-id"
+    real.touch()
+    link.symlink_to(real)
+    text = f'{HEAD}[[line]]\nname = "a"\nport = "{real}"\n{DEVICE.format(n=1)}'
+    text += f'[[line]]\nname = "b"\nport = "{link}"\n{DEVICE.format(n=2)}{OWN_ROOT}{COMMUNITY}'
+    assert advised(text) == (
+        f"line[1].port: {link} is at present the same port as line[0].port; only one line can have it",
+    )
+
+
+def test_a_face_that_is_off_needs_no_advice() -> None:
+    assert advised(f"{HEAD}{LINE}[snmp]\nlisten = []\n") == ()

@@ -1,0 +1,200 @@
+"""The gateway put together: what the configuration says reaches every part, and it starts and stops on any loop."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from ipaddress import ip_network
+
+import pytest
+
+from gateway.clock import SystemClock
+from gateway.service.config import Config, parse_config
+from gateway.service.gateway import Gateway
+from gateway.service.loops import Loop, loop_factory
+from gateway.service.schema import LineTable, PollTable
+from gateway.service.settings import (
+    http_settings,
+    line_budgets,
+    line_devices,
+    line_settings,
+    modbus_settings,
+    snmp_settings,
+)
+
+TEXT = """
+site = "ridge-07"
+[[line]]
+name = "shelter-a"
+port = "/nonexistent/a"
+baudrate = 19200
+parity = "E"
+stopbits = 1
+reply_timeout_s = 0.25
+retries = 1
+quarantine_s = 0.2
+gap_s = 0.05
+queue_limit = 9
+queue_limit_s = 1.5
+[[line.device]]
+name = "array-2"
+address = 2
+unit_id = 12
+model = "prostar-mppt"
+decode = { charge_energy_total = "f16" }
+[[line.device]]
+name = "array-1"
+address = 1
+unit_id = 11
+model = "prostar-mppt"
+[[line]]
+name = "shelter-b"
+port = "socket://192.0.2.1:4001"
+[[line.device]]
+name = "array-3"
+address = 1
+unit_id = 3
+model = "prostar-mppt"
+[poll]
+live_s = 2.0
+settings_s = 60.0
+[cache]
+max_age_s = 7.0
+[modbus]
+listen = ["127.0.0.1:0", "[::1]:0"]
+max_connections = 3
+allow = ["10.1.2.0/24", "10.9.9.9"]
+strict_map = true
+[snmp]
+listen = ["127.0.0.1:0"]
+enterprise_root = "1.3.6.1.4.1.12345.7"
+contact = "noc@example.net"
+location = "Ridge"
+[[snmp.community]]
+name = "s3cret"
+source = ["10.0.0.0/8"]
+[http]
+listen = ["127.0.0.1:0"]
+"""
+
+
+@pytest.fixture
+def config() -> Config:
+    return parse_config(TEXT)
+
+
+def test_every_key_of_a_line_reaches_its_settings(config: Config) -> None:
+    first, second = line_settings(config)
+    table = config.line[0]
+    for key in LineTable.model_fields.keys() - {"device"}:
+        assert getattr(first, key) == getattr(table, key), key
+        if key not in {"name", "port", "bytesize"}:
+            assert getattr(first, key) != getattr(second, key), key  # the test's values are not the defaults
+    assert (first.index, second.index) == (1, 2)
+    for settings in (first, second):
+        assert all(getattr(settings.poll, key) == getattr(config.poll, key) for key in PollTable.model_fields)
+
+
+def test_devices_know_their_map_and_reading(config: Config) -> None:
+    second, first = line_devices(config.line[0])
+    assert (second.name, second.address, second.unit_id, second.decode) == (
+        "array-2",
+        2,
+        12,
+        {"charge_energy_total": "f16"},
+    )
+    assert first.decode == {}
+    assert first.map.model == "prostar-mppt"
+
+
+def test_the_faces_get_their_settings(config: Config) -> None:
+    modbus = modbus_settings(config)
+    assert modbus.listen == (("127.0.0.1", 0), ("::1", 0))
+    assert modbus.allow == (ip_network("10.1.2.0/24"), ip_network("10.9.9.9/32"))
+    assert (modbus.max_connections, modbus.max_age_s, modbus.strict_map) == (3, 7.0, True)
+    snmp = snmp_settings(config)
+    assert snmp.listen == (("127.0.0.1", 0),)
+    assert [(entry.name, entry.sources) for entry in snmp.communities] == [("s3cret", (ip_network("10.0.0.0/8"),))]
+    assert "s3cret" not in repr(snmp)
+    assert snmp.enterprise_root == (1, 3, 6, 1, 4, 1, 12345, 7)
+    assert (snmp.contact, snmp.location) == ("noc@example.net", "Ridge")
+    assert http_settings(config).listen == (("127.0.0.1", 0),)
+
+
+def test_the_face_gives_up_before_the_supervisor_does(config: Config) -> None:
+    from gateway.service.supervisor import STOP_LISTENERS_S
+
+    assert modbus_settings(config).stop_grace_s < STOP_LISTENERS_S
+    assert http_settings(config).stop_grace_s < STOP_LISTENERS_S
+
+
+def test_without_a_community_no_snmp_port_is_opened() -> None:
+    config = parse_config(TEXT.partition("[[snmp.community]]")[0])
+    assert snmp_settings(config).listen == ()
+    gateway = Gateway(config, SystemClock())
+    assert [listener.label.split()[0] for listener in gateway.listeners] == ["modbus", "modbus", "http"]
+
+
+def test_the_config_never_shows_a_community(config: Config) -> None:
+    assert "s3cret" not in repr(config)
+    assert "s3cret" not in str(config)
+
+
+def test_a_site_has_its_devices_by_unit_id_and_line(config: Config) -> None:
+    gateway = Gateway(config, SystemClock())
+    assert [device.unit_id for device in gateway.site.devices] == [3, 11, 12]
+    assert [device.line.name for device in gateway.site.devices] == ["shelter-b", "shelter-a", "shelter-a"]
+    assert gateway.not_ready() == (
+        "modbus 127.0.0.1:0 is not open",
+        "modbus [::1]:0 is not open",
+        "snmp 127.0.0.1:0 is not open",
+        "http 127.0.0.1:0 is not open",
+    )
+
+
+def test_a_line_with_more_devices_is_used_more(config: Config) -> None:
+    first, second = line_budgets(config)
+    assert 0 < second.use_ratio < first.use_ratio < 1
+    assert first.reply_deadline_s < second.reply_deadline_s  # shorter queue and time-out, one retry less
+
+
+async def lifetime(config: Config) -> None:
+    gateway = Gateway(config, SystemClock())
+    stop = asyncio.Event()
+    running = asyncio.create_task(gateway.run(stop))
+    try:
+        async with asyncio.timeout(10):
+            while gateway.not_ready():  # noqa: ASYNC110  # asked as /readyz asks: there is no event
+                await asyncio.sleep(0.01)
+        _, port = next(listener.bound for listener in gateway.listeners if listener.bound is not None)
+        _, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.close()
+        await writer.wait_closed()
+    finally:
+        stop.set()
+        await running
+    assert all(listener.bound is None for listener in gateway.listeners)
+
+
+@pytest.mark.parametrize("choice", [Loop.ASYNCIO, Loop.UVLOOP, Loop.AUTO])
+def test_it_starts_and_stops_on_either_loop(choice: Loop) -> None:
+    if choice is Loop.UVLOOP:
+        pytest.importorskip("uvloop")
+    config = parse_config(TEXT.replace(', "[::1]:0"', "").replace("socket://192.0.2.1:4001", "/nonexistent/b"))
+    with asyncio.Runner(loop_factory=loop_factory(choice)) as runner:
+        runner.run(lifetime(config))
+
+
+@pytest.mark.parametrize(
+    ("choice", "expected"),
+    [(Loop.AUTO, "asyncio"), (Loop.ASYNCIO, "asyncio"), (Loop.UVLOOP, None)],
+)
+def test_without_uvloop_it_runs_unless_asked_for(
+    monkeypatch: pytest.MonkeyPatch, choice: Loop, expected: str | None
+) -> None:
+    monkeypatch.setitem(sys.modules, "uvloop", None)
+    if expected is None:
+        with pytest.raises(ValueError, match="uvloop is not installed"):
+            loop_factory(choice)
+    else:
+        assert loop_factory(choice) is asyncio.new_event_loop
