@@ -49,7 +49,8 @@ def plain_lines(view: View, rates: Mapping[str, float]) -> list[str]:
         f"{device.line}/{device.name} unit={device.unit_id} battery={_pair(device, 'battery')} "
         f"array={_pair(device, 'array')} load={_pair(device, 'load')} "
         f"charge={device.states.get('charge_state', _NONE)} "
-        f"load_state={device.states.get('load_state', _NONE)} age={_age(device)} quality={device.quality}"
+        f"load_state={device.states.get('load_state', _NONE)} "
+        f"age={_age(device).replace(' ', '')} quality={device.quality}"
         for device in view.devices
     ]
     rows += [

@@ -1,0 +1,84 @@
+"""The command line from outside: names, exit statuses, where the output goes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+
+REPOSITORY = Path(__file__).parents[2]
+CONFIGS = REPOSITORY / "config"
+
+
+def run(*arguments: str) -> tuple[int, str, str]:
+    result = CliRunner(env={"COLUMNS": "100", "NO_COLOR": "1"}).invoke(app, list(arguments))
+    return result.exit_code, result.stdout, result.stderr
+
+
+@pytest.mark.parametrize(
+    "command", [[sys.executable, "-m", "gateway"], [str(Path(sys.executable).with_name("prostar-gateway"))]]
+)
+def test_the_command_and_the_module_are_the_same(command: list[str]) -> None:
+    done = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"prostar-gateway {version('prostar-gateway')}\n"
+
+
+def test_help_names_every_command() -> None:
+    status, shown, _ = run("--help")
+    assert status == 0
+    for command in ("run", "check-config", "demo", "simulate", "generate"):
+        assert f" {command} " in shown
+
+
+def test_check_config_shows_what_the_lines_can_do() -> None:
+    status, shown, said = run("check-config", "-c", str(CONFIGS / "full.toml"))
+    assert (status, said) == (0, "")
+    rows = [row.split() for row in shown.splitlines()]
+    assert [row[0] for row in rows if row and row[-1] == "s" and row[0].startswith("shelter")] == [
+        "shelter-a",
+        "shelter-b",
+    ]
+    line_a = next(row for row in rows if row and row[0] == "shelter-a")
+    devices, use, deadline, unit = line_a[-4:]
+    assert (devices, unit) == ("2", "s")
+    assert 40 < float(use.rstrip("%")) < 70
+    assert 7 < float(deadline) < 10
+    by_unit = {row[0]: row for row in rows if len(row) > 5 and row[0].isdigit()}
+    assert list(by_unit) == ["11", "12", "13"]
+    assert by_unit["13"] == ["13", "array-3", "shelter-b", "1", "prostar-mppt", "1.0", "s", "300", "s"]
+    assert "Modbus TCP 127.0.0.1:1502 · SNMP 127.0.0.1:1161 · HTTP 127.0.0.1:9850" in shown
+    assert "warning snmp.enterprise_root: 32473" in shown
+    assert shown.endswith("full.toml is right.\n")
+    assert "k7-ridge-reader" not in shown
+
+
+def test_check_config_warns_of_a_line_that_is_too_busy(tmp_path: Path) -> None:
+    text = 'site = "a"\n[[line]]\nname = "[bold]"\nport = "/dev/a"\n'
+    for n in range(1, 9):
+        text += f'[[line.device]]\nname = "d{n}"\naddress = {n}\nunit_id = {n}\nmodel = "prostar-mppt"\n'
+    path = tmp_path / "site.toml"
+    path.write_text(text)
+    status, shown, _ = run("check-config", "-c", str(path))
+    assert status == 0
+    assert "[bold]" in shown  # a name is not markup
+    assert "warning line[0]: polling would take 21" in shown
+    assert "SNMP off (no community)" in shown
+
+
+@pytest.mark.parametrize("command", ["run", "check-config"])
+def test_a_missing_file_is_a_bad_config(command: str, tmp_path: Path) -> None:
+    status, shown, said = run(command, "-c", str(tmp_path / "no.toml"))
+    assert (status, shown) == (78, "")
+    assert said.splitlines()[0] == f"{tmp_path / 'no.toml'}: cannot be read: No such file or directory"
+
+
+def test_a_config_must_be_named() -> None:
+    status, _, said = run("run")
+    assert status == 2
+    assert "--config" in said
