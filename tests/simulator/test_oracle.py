@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gateway.devices.model import DeviceMap, Space
+from gateway.modbus.pdu import parse_identification, read_identification_request
 from gateway.simulator.oracle import OracleController
 
 
@@ -62,3 +63,8 @@ def test_there_is_room_for_fifteen_devices(prostar_map: DeviceMap) -> None:
     OracleController(prostar_map, device=14)
     with pytest.raises(ValueError, match="no room for device 15"):
         OracleController(prostar_map, device=15)
+
+
+def test_the_revision_names_the_device(oracles: tuple[OracleController, ...]) -> None:
+    replies = [parse_identification(unit.handle(read_identification_request(), 0.0) or b"") for unit in oracles]
+    assert [reply.objects[2] for reply in replies] == [b"v01.00.00", b"v01.00.01", b"v01.00.02"]
