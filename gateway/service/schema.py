@@ -185,7 +185,7 @@ class LineTable(Table):
     ] = Field(default=_LINE.queue_limit, ge=1, le=1000)
     queue_limit_s: Annotated[
         Seconds,
-        Key("0.1 to 60.0", "How long a client read may wait for the line; after that it is answered 0B."),
+        Key("0.1 to 60.0", "How long a client read may wait for the line; after that it is answered 06."),
     ] = Field(default=_LINE.queue_limit_s, ge=0.1, le=60.0)
     device: Annotated[
         Annotated[tuple[DeviceTable, ...], Field(strict=False)],
