@@ -8,6 +8,7 @@ from random import Random
 from typing import Any
 
 from gateway.core.engine import LineEngine
+from gateway.core.identity import Identity
 from gateway.core.requests import Lane, Waiter
 from gateway.core.settings import LineSettings
 from gateway.core.site import Device, Outcome
@@ -65,11 +66,13 @@ class VirtualLine:
         return outcomes[0]
 
 
-def make_line(*stations: Station, opened: bool = True, **settings: Any) -> VirtualLine:
+def make_line(
+    *stations: Station, opened: bool = True, expected: Identity | None = None, **settings: Any
+) -> VirtualLine:
     """An engine with one device a station on one line; `settings` are those of LineSettings."""
     line_settings = LineSettings(name="line", index=1, port="virtual", **settings)
     devices = [
-        Device(f"array-{index}", 10 + index, station.address, load_map("prostar-mppt"))
+        Device(f"array-{index}", 10 + index, station.address, load_map("prostar-mppt"), expected=expected or Identity())
         for index, station in enumerate(stations, 1)
     ]
     line = VirtualLine(line_settings, devices, SimulatedLine(stations), start=1000.0)

@@ -1,0 +1,77 @@
+"""Is it still the same controller?"""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.core.identity import Identity
+from gateway.devices.model import Growing
+
+HOURS = Growing("hourmeter", 1.0, clearable=False)
+CHARGE = Growing("charge_total", 60.0, clearable=True)
+RULES = (HOURS, CHARGE)
+
+KNOWN = Identity("PS-MPPT-40", "v01.01.13", None, {"hourmeter": 12000, "charge_total": 5000.0}, at=1000.0)
+
+
+def later(seconds: float, hourmeter: float, charge: float, **more: str) -> Identity:
+    return Identity(
+        more.get("product", "PS-MPPT-40"),
+        more.get("revision", "v01.01.13"),
+        more.get("serial_number"),
+        {"hourmeter": hourmeter, "charge_total": charge},
+        at=1000.0 + seconds,
+    )
+
+
+def test_the_same_unit_a_minute_later() -> None:
+    assert KNOWN.complaint(later(60, 12000, 5000.5), RULES) is None
+
+
+@pytest.mark.parametrize(
+    ("seen", "word"),
+    [
+        (later(10, 12003, 5000.0), "hourmeter"),
+        (later(10, 11999, 5000.0), "hourmeter"),
+        (later(10, 12000, 5400.0), "charge_total"),
+        (later(10, 12000, 4990.0), "charge_total"),
+        (later(10, 12000, 5000.0, product="PS-MPPT-25"), "product"),
+        (later(10, 12000, 5000.0, revision="v01.01.14"), "revision"),
+    ],
+)
+def test_another_unit_is_told_by_what_differs(seen: Identity, word: str) -> None:
+    complaint = KNOWN.complaint(seen, RULES)
+    assert complaint is not None
+    assert complaint.startswith(word)
+
+
+def test_a_cleared_counter_is_no_other_unit() -> None:
+    assert KNOWN.complaint(later(10, 12000, 0.0), RULES) is None
+
+
+def test_a_configured_serial_number_decides_from_the_first_look() -> None:
+    configured = Identity(serial_number="17150342")
+    assert configured.complaint(later(0, 7, 1.0, serial_number="17150342"), RULES) is None
+    complaint = configured.complaint(later(0, 7, 1.0, serial_number="17150343"), RULES)
+    assert complaint == "serial number is 17150343, expected 17150342"
+
+
+def test_what_a_unit_does_not_tell_is_not_compared() -> None:
+    assert Identity(serial_number="17150342").complaint(Identity(), RULES) is None
+    assert Identity().complaint(later(0, 1, 1.0), RULES) is None
+
+
+def test_what_was_configured_is_never_unlearned() -> None:
+    learned = Identity(product="PS-MPPT-40", serial_number="1").learned(later(0, 5, 6.0))
+    assert learned.serial_number == "1"
+    assert learned.counters == {"hourmeter": 5, "charge_total": 6.0}
+    assert learned.learned(Identity(at=9e9)).at == learned.at
+
+
+@given(st.floats(0, 1e7), st.floats(0, 1), st.floats(0, 1))
+def test_a_unit_is_always_itself_whatever_the_outage(outage_s: float, ran: float, sun: float) -> None:
+    """However long it was away, and however much of that it ran and charged."""
+    hours = outage_s / 3600
+    assert KNOWN.complaint(later(outage_s, 12000 + int(hours * ran), 5000 + 60 * hours * sun), RULES) is None
