@@ -83,3 +83,33 @@ def test_every_target_of_the_makefile_is_explained() -> None:
     phony = set(re.findall(r"^\.PHONY: (.+)$", makefile, re.MULTILINE))
     explained = set(re.findall(r"^([a-z-]+):.*## \S", makefile, re.MULTILINE))
     assert phony == explained
+
+
+def named_tests() -> list[tuple[str, str]]:
+    """Page and `tests/…py::test_…` of every promise that names its proof."""
+    pattern = re.compile(r"`(tests/[\w/.]+\.py(?:::\w+)?)`")
+    return [(str(page), name) for page in PAGES for name in pattern.findall(read(page))]
+
+
+@pytest.mark.parametrize(("page", "name"), named_tests())
+def test_a_promise_names_a_test_that_exists(page: str, name: str) -> None:
+    path, _, function = name.partition("::")
+    assert (ROOT / path).is_file(), page
+    assert not function or re.search(rf"^(?:async )?def {function}\(", read(path), re.MULTILINE), page
+
+
+def test_the_readme_opens_with_the_problem_and_the_two_commands() -> None:
+    opening = read("README.md").splitlines()[:12]
+    problem = [line for line in opening[2:] if line][:5]
+    assert all(len(line) <= 140 for line in problem)
+    assert opening[8] == "```"
+    assert [line.split("#")[0].strip() for line in opening[9:11]] == ["make demo", "make test"]
+
+
+def test_the_readme_shows_a_configuration_that_is_right(tmp_path: Path) -> None:
+    from gateway.service.config import load_config
+
+    (example,) = re.findall(r"```toml\n(.*?)```", read("README.md"), re.DOTALL)
+    path = tmp_path / "readme.toml"
+    path.write_text(example, encoding="utf-8")
+    assert load_config(path).site == "ridge-07"
