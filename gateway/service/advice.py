@@ -36,6 +36,11 @@ def _lines(config: Config, budgets: Sequence[LineBudget]) -> Iterator[str]:
                 f"{path}: live values come every {budget.live_refresh_s:.1f} s, which is not within cache.max_age_s "
                 f"({config.cache.max_age_s} s): Modbus reads will have to wait for the line"
             )
+    if config.poll.night_s is not None and config.poll.night_s >= config.cache.max_age_s > config.poll.live_s:
+        yield (
+            f"poll.night_s: {config.poll.night_s:g} s is not within cache.max_age_s ({config.cache.max_age_s:g} s): "
+            "Modbus reads will have to wait for the line at night"
+        )
 
 
 def _port(path: str, line: LineTable, seen: dict[str, str]) -> Iterator[str]:

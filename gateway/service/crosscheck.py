@@ -83,6 +83,7 @@ def _model(path: Path, device: Raw) -> Iterator[Problem]:
         what = f"finding the model by itself is {NOT_SUPPORTED}" if model == "auto" else f"{show(model)} has no map"
         yield Problem((*path, "model"), f"{what}; allowed: {known}")
         return
+    yield from _identity(path, device, model)
     decode = device.get("decode")
     if not isinstance(decode, Mapping):
         return
@@ -94,6 +95,20 @@ def _model(path: Path, device: Raw) -> Iterator[Problem]:
         elif isinstance(reading, str) and reading not in (names := [known.name for known in points[name].readings]):
             allowed = ", ".join(f'"{known}"' for known in names)
             yield Problem((*path, "decode", name), f"{show(reading)} is no reading of this point; allowed: {allowed}")
+
+
+def _identity(path: Path, device: Raw, model: str) -> Iterator[Problem]:
+    """What no unit of the model can say of itself."""
+    rules = load_map(model).identity
+    product = device.get("product")
+    fits = isinstance(product, str) and (product in rules.product_codes or product.startswith(rules.product_prefixes))
+    if isinstance(product, str) and not fits:
+        allowed = [*rules.product_codes, *(f"{prefix}…" for prefix in rules.product_prefixes)]
+        text = f"no {model} calls itself {show(product)}; allowed: {', '.join(allowed)}"
+        yield Problem((*path, "product"), text)
+    if isinstance(device.get("serial_number"), str) and rules.serial_first is None:
+        text = f"a {model} tells no serial number; allowed: leave it out"
+        yield Problem((*path, "serial_number"), text)
 
 
 def _listen_clashes(raw: Raw, faces: tuple[str, ...]) -> Iterator[Problem]:

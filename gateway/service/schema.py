@@ -146,6 +146,20 @@ class DeviceTable(Table):
             "Another reading of a point than the document's, for units that differ from it.",
         ),
     ] = Field(default_factory=dict)
+    product: Annotated[
+        Annotated[str, Field(pattern=r"^[!-~]([ -~]{0,62}[!-~])?$")] | None,
+        Key(
+            "the product code of a unit of the model, such as PS-MPPT-40M",
+            "What the unit must call itself, else nothing of it is served.",
+        ),
+    ] = None
+    serial_number: Annotated[
+        Annotated[str, Field(pattern=r"^[!-~]{1,32}$")] | None,
+        Key(
+            "1 to 32 printable ASCII characters without blanks",
+            "The serial number that the unit must tell, else nothing of it is served; one without is not refused.",
+        ),
+    ] = None
 
 
 class LineTable(Table):
@@ -204,6 +218,14 @@ class PollTable(Table):
         Seconds,
         Key("1.0 to 86400.0", "How often the controller's settings are wanted."),
     ] = Field(default=_POLL.settings_s, ge=1.0, le=86400.0)
+    night_s: Annotated[
+        Seconds | None,
+        Key(
+            "0.2 to 3600.0",
+            "How often live values are wanted of a controller that says that it is night; "
+            "left out or below live_s: as by day.",
+        ),
+    ] = Field(default=_POLL.night_s, ge=0.2, le=3600.0)
 
 
 class CacheTable(Table):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 
 from gateway.core.budget import LineBudget, line_budget
+from gateway.core.identity import Identity
 from gateway.core.settings import LineSettings, PollSettings
 from gateway.core.site import Device
 from gateway.devices.schema import load_map
@@ -21,7 +22,7 @@ STOP_GRACE_S = 1.0
 
 def line_settings(config: Config) -> tuple[LineSettings, ...]:
     """The settings of every line, in the order of the file."""
-    poll = PollSettings(live_s=config.poll.live_s, settings_s=config.poll.settings_s)
+    poll = PollSettings(config.poll.live_s, config.poll.settings_s, config.poll.night_s)
     return tuple(
         LineSettings(
             name=line.name,
@@ -52,6 +53,7 @@ def line_devices(line: LineTable) -> tuple[Device, ...]:
             address=device.address,
             map=load_map(device.model),
             decode=dict(device.decode),
+            expected=Identity(product=device.product, serial_number=device.serial_number),
         )
         for device in line.device
     )

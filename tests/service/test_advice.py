@@ -53,6 +53,10 @@ def test_a_file_that_is_as_it_should_be_needs_none() -> None:
         ),
         (CLEAN + "[cache]\nmax_age_s = 0.5\n", "line[0]: live values come every 1.0 s, which is not within cache.max"),
         (
+            CLEAN + "[poll]\nnight_s = 30.0\n",
+            "poll.night_s: 30 s is not within cache.max_age_s (5 s): Modbus reads",
+        ),
+        (
             HEAD + LINE + "".join(DEVICE.format(n=n) for n in range(2, 9)) + OWN_ROOT + COMMUNITY,
             "% of the line, so live values come every 2.",
         ),

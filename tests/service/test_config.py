@@ -118,7 +118,7 @@ def test_the_full_example_names_every_key_and_comments_it() -> None:
 
 def test_the_full_example_shows_the_defaults() -> None:
     full, minimal = load_config(CONFIGS / "full.toml"), load_config(CONFIGS / "minimal.toml")
-    assert full.poll == minimal.poll
+    assert full.poll.model_copy(update={"night_s": None}) == minimal.poll  # TOML cannot show "as by day"
     assert full.cache == minimal.cache
     assert full.modbus == minimal.modbus
     assert full.http == minimal.http
@@ -276,6 +276,19 @@ listen = ["127.0.0.1:70000"]
             'line[0].device[0].decode.charge_energy_total: "f17" is no reading of this point; allowed: "document", "f1',
         ),
         (with_device("[line.device.decode]\ncharge_energy_total = 16\n"), "charge_energy_total: 16 is not a text"),
+        (
+            with_device('product = "TS-MPPT-60"\n'),
+            'line[0].device[0].product: no prostar-mppt calls itself "TS-MPPT-60"; allowed: PS-MPPT-25, ',
+        ),
+        (
+            with_device('product = "PS-MPPT-40M "\n'),
+            'product: "PS-MPPT-40M " is not allowed; allowed: the product',
+        ),
+        (
+            with_device("serial_number = 17410042\n"),
+            "serial_number: 17410042 is not a text; allowed: 1 to 32",
+        ),
+        (with_device("[poll]\nnight_s = 0.1\n"), "poll.night_s: 0.1 is out of range; allowed: 0.2 to 3600.0"),
     ],
 )
 def test_a_problem_names_key_fault_and_what_is_allowed(text: str, expected: str) -> None:

@@ -35,7 +35,7 @@ def default(field: FieldInfo) -> str:
         return "see below"
     if isinstance(value, tuple):
         value = list(value)
-    return "none" if value in ([], {}) else f"`{show(value)}`"
+    return "none" if value in ([], {}, None) else f"`{show(value)}`"
 
 
 def row(name: str, field: FieldInfo) -> str:

@@ -9,6 +9,7 @@ from ipaddress import ip_network
 import pytest
 
 from gateway.clock import SystemClock
+from gateway.core.identity import Identity
 from gateway.service.config import Config, parse_config
 from gateway.service.gateway import Gateway
 from gateway.service.loops import Loop, loop_factory
@@ -42,6 +43,8 @@ address = 2
 unit_id = 12
 model = "prostar-mppt"
 decode = { charge_energy_total = "f16" }
+product = "PS-MPPT-25M"
+serial_number = "17410042"
 [[line.device]]
 name = "array-1"
 address = 1
@@ -58,6 +61,7 @@ model = "prostar-mppt"
 [poll]
 live_s = 2.0
 settings_s = 60.0
+night_s = 6.0
 [cache]
 max_age_s = 7.0
 [modbus]
@@ -103,7 +107,9 @@ def test_devices_know_their_map_and_reading(config: Config) -> None:
         12,
         {"charge_energy_total": "f16"},
     )
+    assert second.expected == Identity(product="PS-MPPT-25M", serial_number="17410042")
     assert first.decode == {}
+    assert first.expected == Identity()
     assert first.map.model == "prostar-mppt"
 
 
