@@ -150,8 +150,15 @@ def _rules(device_map: DeviceMap) -> Iterator[str]:
     if device_map.night is not None and device_map.night.point not in polled:
         yield f"night: no polled point {device_map.night.point}"
     for point in device_map.points:
-        if point.access is Access.READ and (point.rewrite_s is not None or point.restarts):
-            yield f"point {point.name}: rewrite_s and restarts are for what can be written"
+        if point.access is Access.READ and (point.rewrite_s, point.restarts, point.named_only, point.wears) != (
+            None,
+            False,
+            False,
+            False,
+        ):
+            yield f"point {point.name}: rewrite_s, restarts, named_only and wears are for what can be written"
+        if point.restarts and not point.named_only:
+            yield f"point {point.name}: what restarts the device is named_only"
 
 
 def _number_tables(device_map: DeviceMap) -> Iterator[str]:

@@ -67,6 +67,7 @@ class Extent:
     poll: PollClass
     writable: bool
     doc: str
+    wears: bool = False  # memory that lasts only so many writes (EEPROM)
 
     @property
     def count(self) -> int:
@@ -126,6 +127,8 @@ class Point:
     note: str = ""  # where document and field, or two places of the document, disagree
     rewrite_s: float | None = None  # a value not zero must be written again at least this often, or the device faults
     restarts: bool = False  # a write restarts the device, which then does not answer: silence is success
+    named_only: bool = False  # to be written only where its very name was allowed, never as one of a range
+    wears: bool = False  # a write makes the device write its own EEPROM
 
     @property
     def polled(self) -> bool:
@@ -254,6 +257,13 @@ class DeviceMap:
             if point.space is space and point.address == address and point.access is not Access.READ:
                 return point
         return None
+
+    def wears(self, point: Point) -> bool:
+        """Whether a write to the point uses up memory that lasts only so many writes."""
+        return point.wears or any(
+            extent.wears and extent.space is point.space and extent.first <= point.address <= extent.last
+            for extent in self.extents
+        )
 
     def read_function(self, space: Space) -> int:
         """The function that polls read this space with: of those that the device has, the lowest."""

@@ -62,11 +62,19 @@ class _Extent(_Form):
     last: Address
     poll: Literal["live", "settings", "background"] = "background"
     writable: bool = False
+    wears: bool = False
     doc: Text
 
     def build(self) -> Extent:
         return Extent(
-            self.name, Space(self.space), self.first, self.last, PollClass(self.poll), self.writable, self.doc
+            self.name,
+            Space(self.space),
+            self.first,
+            self.last,
+            PollClass(self.poll),
+            self.writable,
+            self.doc,
+            self.wears,
         )
 
 
@@ -117,6 +125,8 @@ class _Point(_Form):
     note: str = ""
     rewrite_s: Annotated[Number, Field(gt=0)] | None = None
     restarts: bool = False
+    named_only: bool = False
+    wears: bool = False
     mib: _Mib | None = None
     metric: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")] | None = None
     metric_scale: Number = 1
@@ -160,6 +170,8 @@ class _Point(_Form):
             note=self.note,
             rewrite_s=None if self.rewrite_s is None else float(self.rewrite_s),
             restarts=self.restarts,
+            named_only=self.named_only,
+            wears=self.wears,
         )
 
 

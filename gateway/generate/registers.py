@@ -29,7 +29,8 @@ _ACCESS = {Access.READ: "read", Access.WRITE: "read, write", Access.SET: "set"}
 _READING = """\
 Addresses are those in the request PDU, counted from 0. A value is shown in the unit given; a half float that is
 NaN or infinite is no value and is shown nowhere, as is a value outside the bounds under *Plausible values*.
-*Access* is what the controller allows, not what the gateway does. *Reserved* words are shown nowhere but can be read.
+*Access* is what the controller allows; the gateway writes only what a rule allows, and *by name only* what the rule
+names by the point's name, not as one of a range. *Reserved* words are shown nowhere but can be read.
 A dagger (†) marks low confidence, an asterisk (*) an entry under *Notes and other readings*."""
 
 
@@ -148,7 +149,7 @@ def _point_row(point: Point, extent: Extent) -> tuple[str, ...]:
         code(point.symbol),
         point.unit,
         _codec(point, point.readings[0]),
-        _ACCESS[point.access],
+        _ACCESS[point.access] + (", by name only" if point.named_only else ""),
         "never" if point.group is Group.COMMAND else extent.poll.value,
         code(object_name(point.name)) if point.mib is not None else "",
         code(point.metric or ""),

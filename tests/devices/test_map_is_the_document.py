@@ -322,6 +322,17 @@ def test_every_coil_is_a_point_or_reserved(prostar: DeviceMap) -> None:
         )
 
 
+def test_what_must_be_named_to_be_written_and_what_wears(prostar: DeviceMap) -> None:
+    assert {point.name for point in prostar.points if point.named_only} == {
+        *("modbus_id", "meterbus_id", "factory_reset", "reset_control", "force_eeprom_update"),
+        *("clear_charge_resettable", "clear_charge_total", "clear_energy_resettable", "clear_energy_total"),
+        "clear_battery_voltage_extremes",
+    }
+    for point in prostar.points:
+        in_eeprom = point.space is Space.REGISTERS and 0xE000 <= point.address <= 0xE04F
+        assert prostar.wears(point) is (in_eeprom or point.name == "force_eeprom_update"), point.name
+
+
 def test_ranges_are_those_of_the_device(prostar: DeviceMap) -> None:
     assert {(extent.space, extent.first, extent.last, extent.poll) for extent in prostar.extents} == {
         (Space.REGISTERS, 0x0000, 0x0051, PollClass.LIVE),

@@ -117,6 +117,14 @@ def test_wrong_form_names_the_entry(changed: Change, old: str, new: str, entry: 
         ([('access = "write"\n', "")], "point limit: minimum and maximum are for what can be written"),
         ([("plausible = [-100, 100]", "plausible = [100, -100]")], "point limit: plausible"),
         (
+            [('bits = "faults"', 'bits = "faults"\nnamed_only = true')],
+            "point faults: rewrite_s, restarts, named_only and wears are for what can be written",
+        ),
+        (
+            [('help = "Limit."', 'help = "Limit."\nrestarts = true')],
+            "point limit: what restarts the device is named_only",
+        ),
+        (
             [('help = "Limit."', 'help = "Limit."\nmultiplied_by = "times"')],
             "point limit: multiplied_by: no point times",
         ),
