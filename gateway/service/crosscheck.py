@@ -35,6 +35,7 @@ def cross_problems(raw: Raw) -> list[Problem]:
     snmp = _table(raw, "snmp")
     communities = _tables(snmp, "community", ("snmp",))
     problems += _repeated((((*path, "name"), table.get("name")) for path, table in communities), secret=True)
+    problems += _line_listeners(raw, [line.get("name") for _, line in lines])
     problems += _listen_clashes(raw, ("modbus", "http"))
     problems += _listen_clashes(raw, ("snmp",))
     if _table(raw, "modbus").get("writes") is True:
@@ -111,23 +112,42 @@ def _identity(path: Path, device: Raw, model: str) -> Iterator[Problem]:
         yield Problem((*path, "serial_number"), text)
 
 
+def _line_listeners(raw: Raw, lines: list[object]) -> list[Problem]:
+    """A listener stands for a line that there is, and a line has one listener."""
+    listeners = list(_tables(_table(raw, "modbus"), "listener", ("modbus",)))
+    problems = list(_repeated(((*path, "line"), listener.get("line")) for path, listener in listeners))
+    for path, listener in listeners:
+        line = listener.get("line")
+        if isinstance(line, str) and line not in lines:
+            known = ", ".join(show(name) for name in lines if isinstance(name, str))
+            problems.append(Problem((*path, "line"), f"no line is called {show(line)}; allowed: {known}"))
+    return problems
+
+
+def _listens(raw: Raw, face: str) -> Iterator[tuple[Path, object]]:
+    """Every listen address of a face, the default ones too."""
+    table = table_at((face,))
+    assert table is not None
+    own = _table(raw, face)
+    tables: list[tuple[Path, object]] = [((face,), own.get("listen", list(table.model_fields["listen"].default)))]
+    tables += [(path, listener.get("listen")) for path, listener in _tables(own, "listener", (face,))]
+    for path, listens in tables:
+        for index, text in enumerate(listens if isinstance(listens, list) else []):
+            yield (*path, "listen", index), text
+
+
 def _listen_clashes(raw: Raw, faces: tuple[str, ...]) -> Iterator[Problem]:
     """Addresses of one transport that cannot be opened together: the same, or one that covers the other."""
     seen: list[tuple[Address, Path]] = []
-    for face in faces:
-        table = table_at((face,))
-        assert table is not None
-        listens = _table(raw, face).get("listen", list(table.model_fields["listen"].default))
-        for index, text in enumerate(listens if isinstance(listens, list) else []):
-            address = _address(text)
-            if address is None or address.port == 0:
-                continue
-            path: Path = (face, "listen", index)
-            other = next((at for known, at in seen if _covers(known, address)), None)
-            if other is None:
-                seen.append((address, path))
-            else:
-                yield Problem(path, f"{show(text)} clashes with {render_path(other)}; allowed: another address or port")
+    for path, text in (listen for face in faces for listen in _listens(raw, face)):
+        address = _address(text)
+        if address is None or address.port == 0:
+            continue
+        other = next((at for known, at in seen if _covers(known, address)), None)
+        if other is None:
+            seen.append((address, path))
+        else:
+            yield Problem(path, f"{show(text)} clashes with {render_path(other)}; allowed: another address or port")
 
 
 def _address(text: object) -> Address | None:

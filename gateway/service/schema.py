@@ -237,6 +237,19 @@ class CacheTable(Table):
     ] = Field(default=5.0, ge=0.1, le=3600.0)
 
 
+class ListenerTable(Table):
+    """`[[modbus.listener]]`: addresses that stand for one line, for masters whose unit ids cannot be chosen."""
+
+    listen: Annotated[
+        Listens,
+        Key(
+            'a list of "IPv4:port" or "[IPv6]:port", at least one',
+            "Where the line's controllers are asked by their addresses on it: the unit id is `line.device.address`.",
+        ),
+    ] = Field(min_length=1)
+    line: Annotated[Name, Key("the name of a line", "The line that it stands for; each line has one listener at most.")]
+
+
 class ModbusTable(Table):
     """`[modbus]`: the Modbus TCP face."""
 
@@ -251,6 +264,13 @@ class ModbusTable(Table):
         Key("true or false", "Answer 02 for ranges outside of the map without asking the controller."),
     ] = False
     writes: Annotated[bool, Key("false", "Writing to controllers; this version refuses every write.")] = False
+    listener: Annotated[
+        Annotated[tuple[ListenerTable, ...], Field(strict=False)],
+        Key(
+            "[[modbus.listener]] tables",
+            "Further addresses, each for one line, where the unit id is the address there.",
+        ),
+    ] = ()
 
 
 class CommunityTable(Table):

@@ -10,7 +10,7 @@ from gateway.core.settings import LineSettings, PollSettings
 from gateway.core.site import Device
 from gateway.devices.schema import load_map
 from gateway.faces.http.settings import HttpSettings
-from gateway.faces.modbus.settings import ModbusSettings
+from gateway.faces.modbus.settings import LineListen, ModbusSettings
 from gateway.faces.snmp.settings import Community, SnmpSettings
 from gateway.service.schema import Config, LineTable, parse_listen, parse_root
 
@@ -72,6 +72,7 @@ def modbus_settings(config: Config) -> ModbusSettings:
     modbus = config.modbus
     return ModbusSettings(
         listen=_pairs(modbus.listen),
+        lines=tuple(LineListen(_pairs(listener.listen), listener.line) for listener in modbus.listener),
         max_connections=modbus.max_connections,
         allow=tuple(ipaddress.ip_network(network) for network in modbus.allow),
         max_age_s=config.cache.max_age_s,

@@ -9,9 +9,11 @@ import pytest
 from pydantic import ValidationError
 
 from gateway.errors import ConfigError
+from gateway.faces.modbus.settings import LineListen
 from gateway.service.config import Config, load_config, parse_config
 from gateway.service.problems import Problem, in_file_order, render_path
 from gateway.service.schema import Key, Table
+from gateway.service.settings import modbus_settings
 
 CONFIGS = Path(__file__).parents[2] / "config"
 
@@ -120,7 +122,7 @@ def test_the_full_example_shows_the_defaults() -> None:
     full, minimal = load_config(CONFIGS / "full.toml"), load_config(CONFIGS / "minimal.toml")
     assert full.poll.model_copy(update={"night_s": None}) == minimal.poll  # TOML cannot show "as by day"
     assert full.cache == minimal.cache
-    assert full.modbus == minimal.modbus
+    assert full.modbus.model_copy(update={"listener": ()}) == minimal.modbus
     assert full.http == minimal.http
     assert full.state_dir == minimal.state_dir
     shown = set(type(full.line[0]).model_fields) - {"name", "port", "device"}
@@ -394,3 +396,32 @@ def test_problems_sort_by_where_they_stand() -> None:
     found = in_file_order([Problem(("a",), "3"), Problem(("b", 0, "x"), "2"), Problem(("b", 0, "y"), "1")], raw)
     assert [problem.text for problem in found] == ["1", "2", "3"]
     assert render_path(("b", 0, "x")) == "b[0].x"
+
+
+LISTENER = '[[modbus.listener]]\nlisten = ["127.0.0.1:1503"]\nline = "{}"\n'
+
+
+def test_a_listener_stands_for_one_line() -> None:
+    config = parse_config(MINIMAL + LISTENER.format("shelter-a"))
+    settings = modbus_settings(config)
+    assert settings.lines == (LineListen((("127.0.0.1", 1503),), "shelter-a"),)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        (LISTENER.format("shelter-x"), 'modbus.listener[0].line: no line is called "shelter-x"; allowed: "shelter-a"'),
+        (
+            LISTENER.format("shelter-a") + LISTENER.format("shelter-a").replace("1503", "1504"),
+            'modbus.listener[1].line: "shelter-a" is already used by modbus.listener[0].line',
+        ),
+        (
+            LISTENER.format("shelter-a").replace("1503", "1502"),
+            'modbus.listener[0].listen[0]: "127.0.0.1:1502" clashes with modbus.listen[0]',
+        ),
+        (LISTENER.format("shelter-a").replace('"127.0.0.1:1503"', ""), "modbus.listener[0].listen: is empty; allowed:"),
+    ],
+)
+def test_a_listener_that_cannot_be(text: str, problem: str) -> None:
+    (found,) = problems(MINIMAL + text)
+    assert found.startswith(problem)

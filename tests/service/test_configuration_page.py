@@ -21,6 +21,7 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "`[poll]`": schema.PollTable,
     "`[cache]`": schema.CacheTable,
     "`[modbus]`": schema.ModbusTable,
+    "`[[modbus.listener]]`": schema.ListenerTable,
     "`[snmp]`": schema.SnmpTable,
     "`[[snmp.community]]`": schema.CommunityTable,
     "`[http]`": schema.HttpTable,

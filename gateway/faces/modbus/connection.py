@@ -23,7 +23,7 @@ from typing import cast
 from gateway.core.site import Outcome, Ticket
 from gateway.faces.modbus.dispatch import Dispatcher, Forward
 from gateway.faces.modbus.settings import ModbusSettings
-from gateway.faces.modbus.tcp import keep_alive
+from gateway.faces.modbus.tcp import client_name, keep_alive
 from gateway.modbus.mbap import Adu, MbapSplitter
 
 logger = logging.getLogger(__name__)
@@ -82,7 +82,7 @@ class Connection(asyncio.Protocol):
         self._resume: asyncio.Handle | None = None
         self._unsent_since: float | None = None
         self._partial_since: float | None = None
-        self.peer = ""
+        self.peer = ""  # the client's address, by which it is counted and has its share of a line
         self.seen = 0.0  # monotonic time of the last request
 
     # What asyncio calls
@@ -91,8 +91,7 @@ class Connection(asyncio.Protocol):
         """Let the client in, or end the connection before a byte is read."""
         self._transport = cast("asyncio.Transport", transport)
         self.seen = self._now()
-        peername = transport.get_extra_info("peername")
-        self.peer = str(peername[0]) if peername else ""
+        self.peer = client_name(transport.get_extra_info("peername"))
         if not self._admit(self, self.peer):
             self._over = True
             self._transport.abort()
@@ -297,7 +296,9 @@ class Connection(asyncio.Protocol):
             return
         due.forward = answer
         device = answer.device
-        due.ticket = device.line.read(device, answer.ask.pdu, lambda outcome: self._done(due, outcome))
+        due.ticket = device.line.read(
+            device, answer.ask.pdu, lambda outcome: self._done(due, outcome), client=self.peer
+        )
 
     # The way out
 

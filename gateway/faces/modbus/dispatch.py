@@ -8,6 +8,7 @@ that ends a forwarded request is counted under its code as well.
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from gateway.clock import Clock
@@ -42,19 +43,32 @@ class Forward:
         return self.serving.device
 
 
-class Dispatcher:
-    """All requests of the face. Replies are ADUs without their transaction id."""
+class Routes:
+    """Which device a unit id stands for. What is remembered of a device is shared by every way to it."""
 
-    def __init__(self, settings: ModbusSettings, site: Site, clock: Clock, stats: ModbusServerStats) -> None:
-        self.hot = HotReplies()
+    def __init__(self, settings: ModbusSettings, site: Site) -> None:
+        self._serving = [
+            Serving(device, max_age_s=settings.max_age_s, strict_map=settings.strict_map) for device in site.devices
+        ]
+
+    def by_unit(self) -> Mapping[int, Serving]:
+        """The configured unit ids."""
+        return _usable({serving.device.unit_id: serving for serving in self._serving})
+
+    def of_line(self, name: str) -> Mapping[int, Serving]:
+        """The devices of one line by their addresses there: what a port that stands for this line serves."""
+        return _usable({s.device.address: s for s in self._serving if s.device.line.name == name})
+
+
+class Dispatcher:
+    """The requests of one way in. Replies are ADUs without their transaction id."""
+
+    def __init__(self, routes: Mapping[int, Serving], clock: Clock, stats: ModbusServerStats, audit: Audit) -> None:
+        self.hot = HotReplies()  # its keys hold the unit id, which means another device on another way in
         self.stats = stats
         self.now = clock.monotonic
-        self._audit = Audit(stats.refused)
-        self._routes = {
-            unit: Serving(device, max_age_s=settings.max_age_s, strict_map=settings.strict_map)
-            for unit, device in site.by_unit.items()
-            if unit != BROADCAST and unit not in RESERVED
-        }
+        self._audit = audit
+        self._routes = routes
 
     def answer(self, unit: int, pdu: bytes, peer: str, now: float) -> bytes | Forward:
         """The reply to a request, or whom to ask for it."""
@@ -97,3 +111,7 @@ class Dispatcher:
     def _exception(self, unit: int, pdu: bytes, error: RequestError) -> bytes:
         self.stats.exceptions[error.exception_code] += 1
         return mbap.encode(0, unit, exception_reply(pdu[0], error.exception_code))[2:]
+
+
+def _usable(routes: Mapping[int, Serving]) -> Mapping[int, Serving]:
+    return {unit: serving for unit, serving in routes.items() if unit != BROADCAST and unit not in RESERVED}

@@ -18,11 +18,12 @@ from functools import partial
 
 from gateway.clock import Clock
 from gateway.core.log_budget import LogBudget
+from gateway.core.policy import Audit
 from gateway.core.site import Site
 from gateway.core.stats import ModbusServerStats
 from gateway.errors import ListenError
 from gateway.faces.modbus.connection import Connection
-from gateway.faces.modbus.dispatch import Dispatcher
+from gateway.faces.modbus.dispatch import Dispatcher, Routes
 from gateway.faces.modbus.settings import ModbusSettings
 from gateway.faces.modbus.tcp import allowed, bind_problem
 
@@ -35,15 +36,16 @@ BACKLOG = 128
 class Listener:
     """One listening address and the connections that came through it."""
 
-    def __init__(self, server: ModbusServer, host: str, port: int) -> None:
+    def __init__(self, server: ModbusServer, dispatcher: Dispatcher, host: str, port: int, line: str = "") -> None:
         self._server = server
+        self._dispatcher = dispatcher
         self._host = host
         self._port = port
         self._listening: asyncio.Server | None = None
         self._connections: set[Connection] = set()
         self._empty = asyncio.Event()
         shown = f"[{host}]" if ":" in host else host
-        self.label = f"modbus {shown}:{port}"
+        self.label = f"modbus {shown}:{port} line {line}" if line else f"modbus {shown}:{port}"
 
     @property
     def bound(self) -> tuple[str, int] | None:
@@ -86,7 +88,7 @@ class Listener:
 
     def _connection(self) -> Connection:
         server = self._server
-        return Connection(server.dispatcher, server.settings, partial(server.admit, self), self.left)
+        return Connection(self._dispatcher, server.settings, partial(server.admit, self), self.left)
 
     def joined(self, connection: Connection) -> None:
         """A connection was let in."""
@@ -105,8 +107,14 @@ class ModbusServer:
 
     def __init__(self, settings: ModbusSettings, site: Site, clock: Clock, stats: ModbusServerStats) -> None:
         self.settings = settings
-        self.dispatcher = Dispatcher(settings, site, clock, stats)
-        self.listeners: Sequence[Listener] = tuple(Listener(self, host, port) for host, port in settings.listen)
+        audit = Audit(stats.refused)
+        routes = Routes(settings, site)
+        self.dispatcher = Dispatcher(routes.by_unit(), clock, stats, audit)
+        listeners = [Listener(self, self.dispatcher, host, port) for host, port in settings.listen]
+        for group in settings.lines:
+            dispatcher = Dispatcher(routes.of_line(group.line), clock, stats, audit)
+            listeners += [Listener(self, dispatcher, host, port, group.line) for host, port in group.listen]
+        self.listeners: Sequence[Listener] = tuple(listeners)
         self._stats = stats
         self._now = clock.monotonic
         self._connections: set[Connection] = set()

@@ -11,10 +11,19 @@ LOOPBACK: tuple[Network, ...] = (ip_network("127.0.0.0/8"), ip_network("::1/128"
 
 
 @dataclass(frozen=True, slots=True)
+class LineListen:
+    """Addresses that stand for one line: there the unit id is the device's address on that line."""
+
+    listen: tuple[tuple[str, int], ...]
+    line: str
+
+
+@dataclass(frozen=True, slots=True)
 class ModbusSettings:
     """Who may connect, how many, and for how long the server waits for what."""
 
     listen: tuple[tuple[str, int], ...] = (("127.0.0.1", 1502),)
+    lines: tuple[LineListen, ...] = ()
     max_connections: int = 64  # over it the longest idle connection makes room, else the newcomer is refused
     evict_idle_s: float = 10.0  # only a connection that asked nothing for so long has to make room
     allow: tuple[Network, ...] = LOOPBACK

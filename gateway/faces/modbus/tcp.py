@@ -24,6 +24,17 @@ _REASONS = {
 }
 
 
+def client_name(peername: tuple[str, int] | tuple[str, int, int, int] | None) -> str:
+    """The address of a socket's other end without its port; "" when it has gone already.
+
+    One client has one name, whichever way it came: an IPv4 address mapped into IPv6 is written as the IPv4 one.
+    """
+    if not peername:
+        return ""
+    host = peername[0]
+    return host.removeprefix("::ffff:") if "." in host else host
+
+
 def allowed(peer: str, networks: Sequence[Network]) -> bool:
     """Whether an address lies in one of the networks; an IPv4 address mapped into IPv6 counts as the IPv4 one."""
     try:

@@ -89,6 +89,7 @@ class Read:
 @dataclass(eq=False)
 class FakeTicket:
     done: Callable[[Outcome], None] | None
+    client: str = ""
 
     def cancel(self) -> None:
         self.done = None
@@ -119,7 +120,7 @@ class FakeLine:
     def read(
         self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "", background: bool = False
     ) -> FakeTicket:
-        ticket = FakeTicket(done)
+        ticket = FakeTicket(done, client)
         for read in self.waiting:
             if read.device is device and read.pdu == pdu:
                 read.waiters.append(ticket)
@@ -278,7 +279,7 @@ class Running:
         assert bound is not None
         return bound
 
-    async def connect(self, **options: int) -> Client:
+    async def connect(self, **options: object) -> Client:
         reader, writer = await asyncio.open_connection(*self.address, **options)  # type: ignore[arg-type]
         client = Client(reader, writer)
         self.clients.append(client)

@@ -245,7 +245,7 @@ async def test_f49_an_address_that_is_not_allowed_is_cut_off_unread(
         stranger = await running.connect()
         stranger.send(GOOD)
         assert await stranger.rest() == b""
-    friend = await running.connect(local_addr=("127.0.0.2", 0))  # type: ignore[arg-type]
+    friend = await running.connect(local_addr=("127.0.0.2", 0))
     assert await friend.query(12, READ_1) == GOOD_REPLY[7:]
     assert world.stats.requests == 1
     assert world.stats.refused_connections == 3
@@ -313,7 +313,7 @@ async def test_an_error_nobody_foresaw_ends_only_its_connection(
     world = running.world
     client, other = await running.connect(), await running.connect()
     with monkeypatch.context() as patch:
-        patch.setattr(world.line(12), "read", lambda *args: 1 / 0)
+        patch.setattr(world.line(12), "read", lambda *args, **options: 1 / 0)
         client.send(GOOD)
         assert await client.rest() == b""
     assert await other.query(12, READ_1) == GOOD_REPLY[7:]

@@ -9,7 +9,7 @@ from ipaddress import ip_network
 import pytest
 
 from gateway.faces.modbus.settings import LOOPBACK
-from gateway.faces.modbus.tcp import allowed, bind_problem
+from gateway.faces.modbus.tcp import allowed, bind_problem, client_name
 
 from .conftest import Running
 
@@ -30,6 +30,20 @@ from .conftest import Running
 )
 def test_loopback_by_default(peer: str, inside: bool) -> None:
     assert allowed(peer, LOOPBACK) is inside
+
+
+@pytest.mark.parametrize(
+    ("peername", "name"),
+    [
+        (("192.0.2.1", 40000), "192.0.2.1"),
+        (("::1", 40000, 0, 0), "::1"),
+        (("::ffff:192.0.2.1", 40000, 0, 0), "192.0.2.1"),
+        (("fe80::1%eth0", 40000, 0, 2), "fe80::1%eth0"),
+        (None, ""),
+    ],
+)
+def test_a_client_has_one_name(peername: tuple[str, int] | None, name: str) -> None:
+    assert client_name(peername) == name
 
 
 def test_an_address_with_a_scope() -> None:
