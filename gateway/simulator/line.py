@@ -76,6 +76,7 @@ class _Transmission:
 
     start: float
     data: bytes
+    whole: bool
     taken: int = 0
 
 
@@ -85,7 +86,7 @@ class _Pending:
 
     at: float
     number: int
-    data: bytes = field(compare=False)
+    burst: Burst = field(compare=False)
 
 
 class SimulatedLine:
@@ -160,7 +161,7 @@ class SimulatedLine:
             times.append(self._pending[0].at)
         if self._wire:
             head = self._wire[0]
-            wanted = min(len(head.data), head.taken + self._wake_bytes)
+            wanted = len(head.data) if head.whole else min(len(head.data), head.taken + self._wake_bytes)
             times.append(head.start + self.timing.wire_s(wanted))
         return min(times, default=None)
 
@@ -171,7 +172,7 @@ class SimulatedLine:
         while self._wire:
             head = self._wire[0]
             there = min(len(head.data), math.floor((now - head.start + _TOLERANCE_S) / self.timing.char_s))
-            if there > head.taken:
+            if there > head.taken and not (head.whole and there < len(head.data)):
                 arrived += head.data[head.taken : there]
                 head.taken = there
             if head.taken < len(head.data):
@@ -198,14 +199,14 @@ class SimulatedLine:
             if frame_due <= burst_due:
                 self._frame_ended(frame_due)
             else:
-                self._transmit(heapq.heappop(self._pending))
+                self._transmit(heapq.heappop(self._pending).burst)
 
-    def _transmit(self, burst: _Pending) -> None:
+    def _transmit(self, burst: Burst) -> None:
         start = max(burst.at, self._out_end)
         if self._frame and self._in_end > start + _TOLERANCE_S:
             self.counters.collisions += 1
         duration = self.timing.wire_s(len(burst.data))
-        self._wire.append(_Transmission(start, burst.data))
+        self._wire.append(_Transmission(start, burst.data, burst.whole))
         self._out_end = start + duration
         self.counters.bytes_out += len(burst.data)
         self.counters.busy_s += duration
@@ -260,7 +261,7 @@ class SimulatedLine:
         for burst in bursts:
             if burst.data:
                 self._number += 1
-                heapq.heappush(self._pending, _Pending(burst.at, self._number, burst.data))
+                heapq.heappush(self._pending, _Pending(burst.at, self._number, burst))
 
 
 def _superpose(frames: Sequence[bytes]) -> bytes:

@@ -14,10 +14,14 @@ from typing import Protocol
 
 @dataclass(frozen=True, slots=True)
 class Burst:
-    """Bytes for the client that start at `at`, or as soon after it as the wire is free."""
+    """Bytes for the client that start at `at`, or as soon after it as the wire is free.
+
+    `whole`: the client's adapter keeps them back until the last one is there.
+    """
 
     at: float
     data: bytes
+    whole: bool = False
 
 
 class Medium(Protocol):
