@@ -73,7 +73,7 @@ class DeviceRecord:
 
     def store(self, block: Block, now: float) -> None:
         """Take in a block that was read by a poll and publish a new snapshot."""
-        values = self._decoder.decode(block.space, block.first, block.data)
+        values = self._decoder.decode(block.space, block.first, block.data, block.count)
         self.device.stats.implausible = self._decoder.implausible
         self._parts[(block.space, block.first, block.count)] = (block, values)
         self._merge(last_reply_at=now)
