@@ -19,10 +19,8 @@ PR_SET_PDEATHSIG = 1
 STOP_S = 1.5
 
 
-def start_gateway_command(
-    arguments: Sequence[str], log: IO[bytes], *, stdout: IO[bytes] | int
-) -> subprocess.Popen[bytes]:
-    """Start `prostar-gateway ARGUMENTS`; its standard error goes to `log`."""
+def start_gateway_command(arguments: Sequence[str], log: IO[bytes]) -> subprocess.Popen[bytes]:
+    """Start `prostar-gateway ARGUMENTS`; what it says goes to `log`."""
     libc = ctypes.CDLL(None)  # loaded here: nothing may be loaded between fork and exec
     parent = os.getpid()
 
@@ -34,7 +32,7 @@ def start_gateway_command(
     return subprocess.Popen(  # noqa: S603 - our own interpreter and module
         [sys.executable, "-m", "gateway", *arguments],
         stdin=subprocess.DEVNULL,
-        stdout=stdout,
+        stdout=log,
         stderr=log,
         start_new_session=True,
         preexec_fn=end_with_parent,  # noqa: PLW1509 - no threads are running yet, and only two system calls are made

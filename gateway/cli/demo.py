@@ -9,11 +9,12 @@ Rule 2: what cannot be done is said before anything is drawn: a taken port by it
 
 from __future__ import annotations
 
+import errno
+import os
 import signal
 import socket
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,7 +22,6 @@ from dataclasses import dataclass
 from http.client import HTTPConnection, HTTPException
 from pathlib import Path
 from subprocess import Popen
-from types import FrameType
 from typing import Annotated
 
 import typer
@@ -32,6 +32,7 @@ from gateway.cli.children import last_lines, start_gateway_command, stop_all
 from gateway.cli.demo_commands import COMMUNITY, Try, commands_to_try
 from gateway.cli.demo_screen import commands_text, fitting, plain_lines
 from gateway.cli.demo_view import MODEL, Rates, View, read_view
+from gateway.cli.stopping import Stop
 
 HOST = "127.0.0.1"
 LAYOUT = {"shelter-a": (("array-1", 1, 11), ("array-2", 2, 12)), "shelter-b": (("array-3", 1, 13),)}
@@ -64,27 +65,23 @@ def command(
     http_port: Annotated[int, typer.Option(min=1, max=65535, help="TCP port of the HTTP face.")] = 9850,
 ) -> None:
     """Run three simulated controllers on two serial lines, the gateway and its three faces, and watch them."""
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, _setter(stop))
+    stop = Stop((signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
     console = Console()
     ports = Ports(modbus_port, snmp_port, http_port)
     try:
         _refuse_taken(ports)
         with tempfile.TemporaryDirectory(prefix="prostar-demo-") as folder, _children() as children:
-            with console.status("Starting the simulated controllers and the gateway …"):
-                running = _started(Path(folder), ports, children, stop)
+            running = _Running(Path(folder), ports, children)
+            running.start(console, stop)
             _show(running, ports, console, stop)
     except DemoError as error:
         print(error, file=sys.stderr)
         raise typer.Exit(1) from None
-    except BrokenPipeError:  # nobody reads any more: `demo | head`
-        sys.stderr.close()
-        raise typer.Exit(0) from None
-
-
-def _setter(stop: threading.Event) -> Callable[[int, FrameType | None], None]:
-    return lambda _number, _frame: stop.set()
+    except OSError as error:
+        if error.errno not in {errno.EPIPE, errno.EIO}:
+            raise
+        # Nobody reads any more: `demo | head`, or a terminal that was closed.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _refuse_taken(ports: Ports) -> None:
@@ -118,14 +115,27 @@ def _children() -> Iterator[list[Popen[bytes]]]:
 class _Running:
     """The two processes and the scrapes of the gateway."""
 
-    def __init__(self, folder: Path, ports: Ports, children: Sequence[Popen[bytes]]) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, ports: Ports, children: list[Popen[bytes]]) -> None:
+        self._folder = folder
         self._ports = ports
         self._children = children
+        self._names: list[str] = []
+
+    def start(self, console: Console, stop: Stop) -> None:
+        """Start the simulator and the gateway; returns when all controllers are online, or a signal came."""
+        self._spawn("simulate", "--link-dir", str(self._folder), *SIMULATION)
+        links = [self._folder / line for line in LAYOUT]
+        with console.status("Starting the simulated controllers …"):
+            self._wait_for(lambda: all(link.exists() for link in links), stop, "the simulated lines to appear")
+        config = self._folder / "demo.toml"
+        config.write_text(demo_config(self._folder, self._ports))
+        self._spawn("run", "-c", str(config))
+        with console.status("Starting the gateway …"):
+            self._wait_for(lambda: _all_online(self.scrape()), stop, "the controllers to answer")
 
     def scrape(self) -> View | None:
         """The view of now, or None when the gateway does not answer; DemoError when a process has ended."""
-        self.check()
+        self._check()
         connection = HTTPConnection(HOST, self._ports.http, timeout=0.5)
         try:
             connection.request("GET", "/metrics")
@@ -135,41 +145,29 @@ class _Running:
         finally:
             connection.close()
 
-    def check(self) -> None:
-        """DemoError when a process has ended, with the end of its log."""
-        for child, name in zip(self._children, ("simulate", "run"), strict=False):
+    def _spawn(self, name: str, *arguments: str) -> None:
+        with (self._folder / f"{name}.log").open("wb") as log:
+            self._children.append(start_gateway_command([name, *arguments], log))
+        self._names.append(name)
+
+    def _check(self) -> None:
+        for child, name in zip(self._children, self._names, strict=True):
             if child.poll() is not None:
-                log = "\n".join(last_lines(self.folder / f"{name}.log"))
+                log = "\n".join(last_lines(self._folder / f"{name}.log"))
                 raise DemoError(f"prostar-gateway {name} ended with status {child.returncode}:\n{log}")
 
-
-def _started(folder: Path, ports: Ports, children: list[Popen[bytes]], stop: threading.Event) -> _Running:
-    """Start simulator and gateway; returns when the first live values are there (or a signal came)."""
-    running = _Running(folder, ports, children)
-    with (folder / "simulate.log").open("wb") as log:
-        children.append(start_gateway_command(["simulate", "--link-dir", str(folder), *SIMULATION], log, stdout=log))
-    began = time.monotonic()
-    while not stop.is_set() and not all((folder / line).exists() for line in LAYOUT):
-        running.check()
-        _not_longer_than(began, "the simulated lines to appear")
-        stop.wait(0.02)
-    config = folder / "demo.toml"
-    config.write_text(demo_config(folder, ports))
-    with (folder / "run.log").open("wb") as log:
-        children.append(start_gateway_command(["run", "-c", str(config)], log, stdout=log))
-    while not stop.is_set() and not _all_online(running.scrape()):
-        _not_longer_than(began, "the controllers to answer")
-        stop.wait(0.1)
-    return running
+    def _wait_for(self, condition: Callable[[], bool], stop: Stop, what: str) -> None:
+        deadline = time.monotonic() + START_S
+        while not condition():
+            self._check()
+            if time.monotonic() > deadline:
+                raise DemoError(f"Waited {START_S:.0f} s for {what}.")
+            if stop.wait(0.05):
+                return
 
 
 def _all_online(view: View | None) -> bool:
     return view is not None and all(device.quality == "online" for device in view.devices)
-
-
-def _not_longer_than(began: float, what: str) -> None:
-    if time.monotonic() - began > START_S:
-        raise DemoError(f"Waited {START_S:.0f} s for {what}.")
 
 
 def demo_config(folder: Path, ports: Ports) -> str:
@@ -184,7 +182,7 @@ def demo_config(folder: Path, ports: Ports) -> str:
     return text + f'\n[http]\nlisten = ["{HOST}:{ports.http}"]\n'
 
 
-def _show(running: _Running, ports: Ports, console: Console, stop: threading.Event) -> None:
+def _show(running: _Running, ports: Ports, console: Console, stop: Stop) -> None:
     commands = commands_to_try(ports.modbus, ports.snmp, ports.http, Path.cwd())
     if console.is_terminal:
         _show_tables(running, commands, console, stop)
@@ -192,20 +190,20 @@ def _show(running: _Running, ports: Ports, console: Console, stop: threading.Eve
         _show_lines(running, commands, stop)
 
 
-def _show_tables(running: _Running, commands: Sequence[Try], console: Console, stop: threading.Event) -> None:
+def _show_tables(running: _Running, commands: Sequence[Try], console: Console, stop: Stop) -> None:
     rates = Rates()
     with Live(console=console, auto_refresh=False, vertical_overflow="crop") as live:
-        while not stop.is_set():
+        while not stop.is_set:
             view = running.scrape()
             if view is not None:
                 live.update(fitting(view, rates.add(view, time.monotonic()), commands, console), refresh=True)
             stop.wait(REFRESH_S)
 
 
-def _show_lines(running: _Running, commands: Sequence[Try], stop: threading.Event) -> None:
+def _show_lines(running: _Running, commands: Sequence[Try], stop: Stop) -> None:
     print(commands_text(commands, labels=True).plain, flush=True)
     rates = Rates()
-    while not stop.is_set():
+    while not stop.is_set:
         view = running.scrape()
         if view is not None:
             print("\n".join(plain_lines(view, rates.add(view, time.monotonic()))), flush=True)

@@ -69,8 +69,8 @@ _PAIRS = {
 
 
 def _devices(devices: Sequence[DeviceView]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False)
-    table.add_column("unit", justify="right")
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+    table.add_column("unit", justify="right", no_wrap=True)
     table.add_column("device\nline", overflow="ellipsis", no_wrap=True, min_width=9)
     for heading in ("battery", "array", "load"):
         table.add_column(heading, justify="right", no_wrap=True, min_width=7)
@@ -90,7 +90,7 @@ def _devices(devices: Sequence[DeviceView]) -> Table:
 
 
 def _lines(lines: Sequence[LineView], rates: Mapping[str, float]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False)
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     table.add_column("line", overflow="ellipsis")
     for heading in ("port", "use", "requests/s", "errors"):
         table.add_column(heading, justify="right", no_wrap=True)

@@ -14,6 +14,7 @@ import subprocess
 import termios
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 
@@ -26,14 +27,14 @@ ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 class Terminal:
     """A process on a terminal of its own."""
 
-    def __init__(self, arguments: list[str], columns: int, rows: int) -> None:
+    def __init__(self, arguments: list[str], columns: int, rows: int, folder: Path) -> None:
         self.master, slave = os.openpty()
         fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
         self.process = subprocess.Popen(
             arguments,
             cwd=REPOSITORY,
             preexec_fn=lambda: os.login_tty(slave),  # noqa: PLW1509  # makes it the controlling terminal: Ctrl-C
-            env={**environment(), "TERM": "xterm-256color", "COLUMNS": "", "LINES": ""},
+            env={**environment(), "TERM": "xterm-256color", "COLUMNS": "", "LINES": "", "TMPDIR": str(folder)},
         )
         os.close(slave)
         self.raw = ""
@@ -96,12 +97,12 @@ def ports(free_tcp_port: Callable[[], int], free_udp_port: Callable[[], int]) ->
 
 
 @pytest.fixture
-def terminal(ports: list[str]) -> Iterator[OpenTerminal]:
+def terminal(ports: list[str], tmp_path: Path) -> Iterator[OpenTerminal]:
     """`terminal(columns=80, rows=24)` starts the demo on a terminal of that size."""
     opened: list[Terminal] = []
 
     def opener(columns: int = 80, rows: int = 24) -> Terminal:
-        opened.append(Terminal([*GATEWAY, "demo", *ports], columns, rows))
+        opened.append(Terminal([*GATEWAY, "demo", *ports], columns, rows, tmp_path))
         return opened[-1]
 
     yield opener
@@ -111,7 +112,7 @@ def terminal(ports: list[str]) -> Iterator[OpenTerminal]:
 
 @pytest.mark.peer
 def test_the_printed_commands_work_and_ctrl_c_leaves_nothing(
-    terminal: OpenTerminal, peer: Callable[[str], str]
+    terminal: OpenTerminal, peer: Callable[[str], str], tmp_path: Path
 ) -> None:
     for program in ("mbpoll", "snmpwalk", "snmptable", "curl"):
         peer(program)
@@ -139,6 +140,7 @@ def test_the_printed_commands_work_and_ctrl_c_leaves_nothing(
     assert demo.interrupt() < 2.0
     assert demo.process.returncode == 0
     assert alive(children) == []
+    assert list(tmp_path.iterdir()) == []
     assert "Traceback" not in demo.text()
     assert demo.raw.rindex("\x1b[?25h") > demo.raw.rindex("\x1b[?25l")  # the cursor is back
 
@@ -212,6 +214,39 @@ def test_taken_ports_are_all_named_with_the_option_to_choose_others(ports: list[
     lines = done.stderr.splitlines()
     assert len(lines) == 3
     assert all(line.startswith(start) for line, start in zip(lines, expected, strict=True))
+
+
+def test_a_storm_of_signals_ends_it_like_one(terminal: OpenTerminal) -> None:
+    demo = terminal()
+    demo.wait_for("array-3")
+    children = children_of(demo.process.pid)
+    began = time.monotonic()
+    for number in (signal.SIGHUP, signal.SIGTERM, signal.SIGINT) * 20:
+        demo.process.send_signal(number)
+    assert demo.ended(began) < 2.0
+    assert demo.process.returncode == 0
+    assert alive(children) == []
+    assert "Traceback" not in demo.text()
+
+
+def test_a_terminal_that_is_closed_ends_it(terminal: OpenTerminal) -> None:
+    demo = terminal()
+    demo.wait_for("array-3")
+    children = children_of(demo.process.pid)
+    os.close(demo.master)
+    demo.master = os.open(os.devnull, os.O_RDONLY)  # for the fixture to close
+    assert demo.process.wait(timeout=5) == 0
+    assert alive(children) == []
+
+
+def test_ctrl_c_while_it_starts_ends_it(terminal: OpenTerminal) -> None:
+    demo = terminal()
+    demo.wait_for("Starting the gateway")
+    children = children_of(demo.process.pid)
+    assert demo.interrupt() < 2.0
+    assert demo.process.returncode == 0
+    assert alive(children) == []
+    assert "Traceback" not in demo.text()
 
 
 def test_a_killed_demo_leaves_no_orphans(terminal: OpenTerminal) -> None:

@@ -1,0 +1,37 @@
+"""Waiting that a signal ends.
+
+A handler runs in the main thread, in the middle of whatever that was doing, and a second signal in the middle of
+the first one's handler. So a handler takes no lock (`threading.Event.set` does, and two quick Ctrl-C hang it): it
+writes one byte to a pipe.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+from collections.abc import Iterable
+from contextlib import suppress
+from types import FrameType
+
+
+class Stop:
+    """Set by any of the signals, for good."""
+
+    def __init__(self, signals: Iterable[signal.Signals]) -> None:
+        self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        for number in signals:
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
+        with suppress(BlockingIOError):  # the pipe is full of earlier signals
+            os.write(self._write, b".")
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for a signal; whether one came, now or earlier."""
+        return bool(select.select([self._read], [], [], timeout_s)[0])
+
+    @property
+    def is_set(self) -> bool:
+        """Whether a signal came."""
+        return self.wait(0.0)

@@ -1,0 +1,42 @@
+"""Waiting that signals end: any number of them, at any moment."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from gateway.cli.stopping import Stop
+
+
+@pytest.fixture
+def stop() -> Iterator[Stop]:
+    before = signal.getsignal(signal.SIGUSR1)
+    yield Stop([signal.SIGUSR1])
+    signal.signal(signal.SIGUSR1, before)
+
+
+def test_without_a_signal_it_waits(stop: Stop) -> None:
+    assert not stop.is_set
+    assert not stop.wait(0.01)
+
+
+def test_a_signal_ends_the_wait_for_good(stop: Stop) -> None:
+    sender = threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGUSR1))
+    sender.start()
+    began = time.monotonic()
+    assert stop.wait(30)
+    assert time.monotonic() - began < 5
+    assert stop.wait(30)
+    assert stop.is_set
+    sender.join()
+
+
+def test_more_signals_than_a_pipe_holds_change_nothing(stop: Stop) -> None:
+    for _ in range(70_000):
+        stop._on_signal(signal.SIGUSR1, None)
+    assert stop.is_set
