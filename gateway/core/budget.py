@@ -51,8 +51,8 @@ def line_budget(settings: LineSettings, maps: Sequence[DeviceMap]) -> LineBudget
         use_ratio=use,
         live_refresh_s=settings.poll.live_s * stretch,
         settings_refresh_s=settings.poll.settings_s * stretch,
-        # One transaction may be under way when the queue time ends.
-        reply_deadline_s=settings.queue_limit_s + (settings.retries + 2) * attempt_s,
+        # One transaction may be under way when the queue time ends; before each try there may be a settling question.
+        reply_deadline_s=settings.queue_limit_s + (2 * (settings.retries + 1) + 1) * attempt_s,
     )
 
 

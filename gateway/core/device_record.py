@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
+from gateway.core.doubt import Doubt
 from gateway.core.health import Breaker
 from gateway.core.identity import Identity
 from gateway.core.scheduler import PollList
@@ -32,6 +33,7 @@ class DeviceRecord:
         self.restarting_until = 0.0  # a restart was commanded: its silence means nothing
         self.rewrites: dict[str, float] = {}  # point that must be written again and again → last written
         self.live_started_at: float | None = None
+        self.doubt = Doubt()
         self._decoder = Decoder(device.map, device.decode)
         self._parts: dict[PartKey, tuple[Block, dict[str, Value]]] = {}
         device.snapshot = Snapshot(state_since=now)

@@ -10,6 +10,10 @@ Rule 4: a write goes out only where the settings allow writes and once it is kno
 Rule 5: a device that was told to restart does not answer: that silence is success, and the silence of the
         seconds after it is no failure.
 Rule 6: nothing is asked for a client of a unit that has not proved to be the expected one (polling.py).
+Rule 7: after a missed reply its device answers a small question of another kind before it is asked on (doubt.py).
+        The turn that has to wait for it is held; when there is no answer, it is the turn that has failed.
+Rule 8: a client's read that the device is too busy for (exception 06) is made once more, if there are retries at
+        all; every other exception, and a second 06, is the answer.
 
 The shell calls `opened`, `closed`, `receive`, `on_timer`, `read` and `write`, then `step` until it returns None,
 writing what it returns, and comes back at `next_deadline`. Outcomes are handed out by `step` only.
@@ -28,7 +32,7 @@ from gateway.core.coalescing import part
 from gateway.core.device_record import DeviceRecord
 from gateway.core.health import Breaker
 from gateway.core.polling import IDENTITY_MISMATCH, Polling
-from gateway.core.requests import ClientRead, Lane, PollItem, ReadTurn, Span, Turn, Waiter, WriteTurn
+from gateway.core.requests import ClientRead, Lane, PollItem, Purpose, ReadTurn, Span, Turn, Waiter, WriteTurn
 from gateway.core.scheduler import PollList, Scheduler
 from gateway.core.settings import LineSettings
 from gateway.core.site import Device, LineState, LineStatus, Outcome
@@ -37,6 +41,7 @@ from gateway.core.stats import LineStats
 from gateway.devices.model import Point
 from gateway.errors import (
     DeviceOffline,
+    DeviceSilent,
     EchoUnknown,
     IdentityUnproven,
     IllegalFunction,
@@ -65,6 +70,7 @@ _READS = frozenset(
 )
 _WRITES = frozenset({Function.WRITE_SINGLE_COIL, Function.WRITE_SINGLE_REGISTER})
 _REFUSALS = (0x02, 0x03)
+_BUSY = 0x06
 
 
 class LineEngine:
@@ -89,6 +95,8 @@ class LineEngine:
         )
         self._accounting = Accounting(self.stats, now)
         self._turn: Turn | None = None
+        self._held: Turn | None = None  # waits for the settling question that is on the wire, or was just answered
+        self._window_s = self._rtu.quarantine_s(now)
         self._sent_at = now
         self._finished: deque[tuple[Waiter, Outcome]] = deque()
         self._state = LineState.DOWN
@@ -108,7 +116,8 @@ class LineEngine:
         known = [refresh_s for refresh_s in refresh if refresh_s is not None]
         stretch = max(1.0, sum(known) / len(known) / self.settings.poll.live_s) if known else 1.0
         use = self._accounting.use_ratio(now)
-        return LineStatus(self._state, self._state_since, self._error, len(self._scheduler), use, stretch)
+        echo = self._rtu.echo.value
+        return LineStatus(self._state, self._state_since, self._error, len(self._scheduler), use, stretch, echo)
 
     def opened(self, now: float) -> None:
         """The port is open: everything is read anew, quarantined devices are probed at once."""
@@ -125,8 +134,12 @@ class LineEngine:
         self._rtu.reset(now)
         if self._turn is not None:
             turn, self._turn = self._turn, None
+            self._records[turn.device.unit_id].doubt.missed(turn.pdu[0])
             self._accounting.ended(turn, self._sent_at, now, "line_down")
             self._finish(_waiters(turn), LineDown(error))
+        if self._held is not None:
+            self._finish(_waiters(self._held), LineDown(error))
+            self._held = None
         self._finish(self._scheduler.drain(), LineDown(error))
         for record in self._records.values():
             if record.state is DeviceState.ONLINE:
@@ -171,12 +184,14 @@ class LineEngine:
         event = self._rtu.receive(data, now)
         if event is not None:
             self._on_event(event, now)
+        self._watch_window(now)
 
     def on_timer(self, now: float) -> None:
         """A deadline may have passed."""
         event = self._rtu.on_timer(now)
         if event is not None:
             self._on_event(event, now)
+        self._watch_window(now)
         self._finish(self._scheduler.expired(now), QueueTimeout(f"waited {self.settings.queue_limit_s:g} s"))
         for record in self._records.values():
             if record.rewrites:
@@ -192,11 +207,12 @@ class LineEngine:
                 log.exception("event=outcome_handler_failed line=%s", self.settings.name)
         if self._state is LineState.DOWN or self._turn is not None or self._rtu.ready_at(now) > now:
             return None
-        turn = self._scheduler.next(now)
+        turn = self._next(now)
         if turn is None:
             return None
+        timeout_s = turn.device.reply_timeout_s or self.settings.reply_timeout_s
         try:
-            frame = self._rtu.send(turn.device.address, turn.pdu, now, self.settings.reply_timeout_s)
+            frame = self._rtu.send(turn.device.address, turn.pdu, now, timeout_s)
         except RequestError as error:  # a client's PDU that has no meaning on a serial line
             if isinstance(turn, PollItem):
                 raise
@@ -218,7 +234,7 @@ class LineEngine:
         moments = [self._rtu.next_deadline(), self._scheduler.next_expiry()]
         moments += [self._polling.next_warning(record) for record in self._records.values() if record.rewrites]
         if self._turn is None and self._rtu.state is State.IDLE:
-            due = self._scheduler.next_due(now)
+            due = now if self._held is not None else self._scheduler.next_due(now)
             moments.append(None if due is None else max(due, self._rtu.ready_at(now)))
         return min((moment for moment in moments if moment is not None), default=None)
 
@@ -234,15 +250,31 @@ class LineEngine:
         ):
             raise IdentityUnproven(device.name)
 
+    def _next(self, now: float) -> Turn | None:
+        """The turn to make now, or the settling question that must be answered before it (rule 7)."""
+        turn, self._held = self._held, None
+        if turn is None or not _wanted(turn):
+            turn = self._scheduler.next(now)
+        if turn is None:
+            return None
+        record = self._records[turn.device.unit_id]
+        if record.doubt.allows(turn.pdu[0]):
+            return turn
+        self._held = turn
+        return self._polling.settling(record, now)
+
     def _sent(self, turn: Turn, now: float) -> None:
         self._turn = turn
         self._sent_at = now
+        self._begun(turn, now)
+        self._accounting.sent(turn, now)
+
+    def _begun(self, turn: Turn, now: float) -> None:
         if isinstance(turn, PollItem):
             self._polling.started(turn, self._records[turn.device.unit_id], now)
         elif isinstance(turn, ReadTurn):
             for read in turn.reads:
                 read.attempts += 1
-        self._accounting.sent(turn, now)
 
     def _on_event(self, event: Replied | Failed, now: float) -> None:
         turn, self._turn = self._turn, None
@@ -250,13 +282,23 @@ class LineEngine:
         record = self._records[turn.device.unit_id]
         if isinstance(event, Failed):
             self._accounting.ended(turn, self._sent_at, now, event.error.label)
-            self._on_failure(turn, record, event.error, now)
+            record.doubt.missed(turn.pdu[0])
+            if turn.purpose is Purpose.SETTLE:
+                self._on_unsettled(record, event.error, now)
+            else:
+                self._on_failure(turn, record, event.error, now)
         else:
             exception = is_exception(event.pdu)
             turn.device.stats.exceptions += exception
             self._accounting.ended(turn, self._sent_at, now, "exception" if exception else None)
+            record.doubt.answered(turn.pdu[0])
             self._heard(record, now)
-            self._on_reply(turn, record, event, now)
+            if turn.purpose is Purpose.SETTLE:
+                record.heard(now)
+                if isinstance(self._held, PollItem):
+                    self._held = None  # it is due still, if it is still wanted
+            else:
+                self._on_reply(turn, record, event, now)
         if isinstance(turn, ReadTurn):
             self._scheduler.charge(turn, now - self._sent_at)
         self._judge(record, now)
@@ -279,6 +321,9 @@ class LineEngine:
             for read in reversed(turn.reads):
                 read.alone = True
                 self._scheduler.retry(read)
+        elif self._puts_off(turn, event.pdu):
+            turn.reads[0].put_off = True
+            self._scheduler.retry(turn.reads[0])
         else:
             for read in turn.reads:
                 self._finish(read.waiters, _answer(turn, read, event.pdu))
@@ -292,11 +337,7 @@ class LineEngine:
                 record.restarting_until = now + RESTART_S
                 self._finish([turn.waiter], turn.pdu)  # the answer to a write is its echo
                 return
-        turn.device.stats.failures += 1
-        if not silent:
-            self._heard(record, now)  # it speaks, if not clearly
-        elif now >= record.restarting_until and not (isinstance(turn, PollItem) and turn.optional):
-            record.breaker.missed(now)
+        self._missed(record, error, now, optional=isinstance(turn, PollItem) and turn.optional)
         if isinstance(turn, PollItem):
             self._polling.failed(turn, record, now)
         elif isinstance(turn, WriteTurn):
@@ -308,6 +349,38 @@ class LineEngine:
                     self._finish(read.waiters, error)
                 else:
                     self._scheduler.retry(read)
+
+    def _on_unsettled(self, record: DeviceRecord, error: RequestError, now: float) -> None:
+        """The settling question failed, and with it the turn that was held for it (rule 7)."""
+        turn, self._held = self._held, None
+        assert turn is not None, "a settling question goes out for a turn only"
+        if isinstance(turn, WriteTurn):
+            self._missed(record, error, now)
+            silent = isinstance(error, ReplyTimeout)
+            self._finish([turn.waiter], DeviceSilent("it is silent; the write was not made") if silent else error)
+        else:
+            self._begun(turn, now)
+            self._on_failure(turn, record, error, now)
+
+    def _missed(self, record: DeviceRecord, error: RequestError, now: float, *, optional: bool = False) -> None:
+        """A device gave no good reply: what that says about it."""
+        record.device.stats.failures += 1
+        if not isinstance(error, ReplyTimeout):
+            self._heard(record, now)  # it speaks, if not clearly
+        elif now >= record.restarting_until and not optional:
+            record.breaker.missed(now)
+
+    def _puts_off(self, turn: ReadTurn, pdu: bytes) -> bool:
+        return is_exception(pdu) and pdu[1] == _BUSY and self.settings.retries > 0 and not turn.reads[0].put_off
+
+    def _watch_window(self, now: float) -> None:
+        """Say when late replies made the quarantine longer, and when it is as configured again."""
+        window_s = self._rtu.quarantine_s(now)
+        if window_s > self._window_s:
+            log.warning("event=late_replies line=%s quarantine_s=%g", self.settings.name, window_s)
+        elif window_s < self._window_s and window_s <= self.settings.quarantine_s:
+            log.info("event=late_replies_over line=%s quarantine_s=%g", self.settings.name, window_s)
+        self._window_s = window_s
 
     def _written(self, turn: WriteTurn, record: DeviceRecord, now: float) -> None:
         """A write was, or may have been, taken: forget the old value and watch what must be rewritten."""
@@ -362,6 +435,13 @@ class LineEngine:
             self._state_since = now
         self._state = state
         self._error = error
+
+
+def _wanted(turn: Turn) -> bool:
+    """Whether anybody still waits for it."""
+    if isinstance(turn, ReadTurn):
+        return any(read.wanted for read in turn.reads)
+    return not (isinstance(turn, WriteTurn) and turn.waiter.left)
 
 
 def _waiters(turn: Turn) -> list[Waiter]:

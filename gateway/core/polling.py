@@ -25,7 +25,7 @@ from gateway.core.site import Device
 from gateway.core.snapshot import Block, DeviceState
 from gateway.devices.model import Identification, PollClass, Space
 from gateway.devices.plan import PlannedBlock, poll_plan, split
-from gateway.modbus.pdu import ReadRequest, parse_identification, read_identification_request
+from gateway.modbus.pdu import Function, ReadRequest, parse_identification, read_identification_request
 from gateway.modbus.rtu import Replied
 
 log = logging.getLogger(__name__)
@@ -58,6 +58,20 @@ class Polling:
         for item in items:
             item.restart(now)
         record.polls.items = sorted(items + self._once(record.device, now), key=_rank)
+
+    def settling(self, record: DeviceRecord, now: float) -> PollItem:
+        """The small question that settles a device's missed replies (doubt.py)."""
+        device = record.device
+        polled = [device.map.read_function(space) for space in Space if space in device.map.functions.values()]
+        functions = list(dict.fromkeys((*polled, *device.map.functions, Function.READ_IDENTIFICATION)))
+        function = record.doubt.choose(functions)
+        if function == Function.READ_IDENTIFICATION:
+            pdu = read_identification_request()
+        else:
+            space = device.map.functions[function]
+            first = next(extent.first for extent in device.map.extents if extent.space is space)
+            pdu = ReadRequest(function, first, 1).encode()
+        return PollItem(device, Purpose.SETTLE, pdu, None, None, now)
 
     def started(self, item: PollItem, record: DeviceRecord, now: float) -> None:
         """A poll goes out: set when it is due again."""

@@ -37,6 +37,7 @@ class Purpose(StrEnum):
     POLL = "poll"
     IDENTIFY = "identify"
     SERIAL_NUMBER = "serial_number"
+    SETTLE = "settle"  # the small question after a missed reply (doubt.py)
     BACKGROUND = "background"
 
 
@@ -77,6 +78,7 @@ class ClientRead:
     queued_at: float
     attempts: int = 0
     alone: bool = False  # the device refused it together with others: never joined again
+    put_off: bool = False  # the device was busy (exception 06) once
     started: bool = False
     waiters: list[Waiter] = field(default_factory=list)
 

@@ -39,6 +39,7 @@ class LineStatus:
     queue_depth: int
     use_ratio: float  # share of the last minute in which a transaction was on the wire, 0..1
     stretch: float = 1.0  # how much longer live values take than asked for; 1 where the line keeps up
+    echo: str = "unknown"  # whether the line gives our own requests back: "unknown", "absent" or "present"
 
 
 class Ticket(Protocol):
@@ -106,6 +107,7 @@ class Device:
     map: DeviceMap
     decode: Mapping[str, str] = field(default_factory=dict)  # point name → reading name
     expected: Identity = field(default_factory=Identity)  # what is configured of the unit itself
+    reply_timeout_s: float | None = None  # None: its line's
     line: LinePort = field(init=False)
     snapshot: Snapshot = field(default_factory=Snapshot)
     stats: DeviceStats = field(default_factory=DeviceStats)

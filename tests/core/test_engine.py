@@ -62,8 +62,8 @@ def state(line: VirtualLine) -> DeviceState:
     return line.devices[0].snapshot.state
 
 
-def registers(address: int, count: int) -> bytes:
-    return ReadRequest(Function.READ_HOLDING_REGISTERS, address, count).encode()
+def registers(address: int, count: int, function: int = Function.READ_HOLDING_REGISTERS) -> bytes:
+    return ReadRequest(function, address, count).encode()
 
 
 def test_a_device_comes_online_with_values_soon_after_the_line_opens(virtual_line: MakeLine) -> None:
@@ -204,7 +204,22 @@ def test_a_silent_device_costs_a_client_all_its_retries_and_then_ends(virtual_li
     controller.silent = True
     controller.asked.clear()
     assert isinstance(line.ask(line.devices[0], registers(0x700, 1)), ReplyTimeout)
-    assert controller.asked.count(registers(0x700, 1)) == 2
+    assert controller.asked == [registers(0x700, 1), registers(0, 1, function=1)]  # once more, and first the question
+
+
+def test_a_silent_device_that_comes_back_answers_a_client_at_its_second_try(virtual_line: MakeLine) -> None:
+    controller = Registers(1)
+    line = virtual_line(controller, retries=1)
+    line.run(1.0)
+    controller.silent = True
+    controller.asked.clear()
+    outcomes: list[Outcome] = []
+    line.read(line.devices[0], registers(0x700, 1), outcomes.append)
+    line.run(0.6)
+    controller.silent = False
+    line.run(1.0)
+    assert outcomes == [bytes.fromhex("03 02 0700")]
+    assert controller.asked[:3] == [registers(0x700, 1), registers(0, 1, function=1), registers(0x700, 1)]
 
 
 def test_three_misses_take_a_device_offline_and_its_reads_fail_at_once(virtual_line: MakeLine) -> None:
