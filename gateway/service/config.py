@@ -6,6 +6,7 @@ What is allowed is in service/schema.py and service/crosscheck.py; how it is sai
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -15,7 +16,7 @@ from gateway.service.crosscheck import cross_problems
 from gateway.service.problems import from_pydantic, in_file_order
 from gateway.service.schema import Config
 
-__all__ = ["Config", "load_config", "parse_config"]
+__all__ = ["Config", "config_of", "load_config", "parse_config"]
 
 
 def load_config(path: Path) -> Config:
@@ -35,6 +36,11 @@ def parse_config(text: str, source: str = "config") -> Config:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:  # its text ends in "(at line 3, column 5)"
         raise ConfigError((f"{source}: not TOML: {error}",)) from None
+    return config_of(raw, source)
+
+
+def config_of(raw: Mapping[str, object], source: str = "config") -> Config:
+    """The configuration in parsed TOML, whatever that holds; ConfigError as `parse_config`."""
     config: Config | None = None
     problems = cross_problems(raw)
     try:

@@ -82,3 +82,10 @@ def test_a_config_must_be_named() -> None:
     status, _, said = run("run")
     assert status == 2
     assert "--config" in said
+
+
+def test_a_loop_that_is_not_installed_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "uvloop", None)
+    status, _, said = run("run", "-c", str(CONFIGS / "minimal.toml"), "--loop", "uvloop")
+    assert status == 2
+    assert "uvloop is not installed" in said
