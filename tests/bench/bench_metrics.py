@@ -1,84 +1,156 @@
-"""What a scrape costs: 200 ProStars through the HTTP face's collectors, against bare prometheus-client.
+"""What a scrape of 200 devices costs over HTTP: the gateway beside prometheus-client's own server.
 
-The peer holds the same series as ready-made gauges, so it does no decoding, no naming and no staleness.
-Rounds are interleaved; medians are printed. `make bench` runs this; nothing passes or fails by it.
+    .venv/bin/python tests/bench/bench_metrics.py [--rounds 15]
+
+Two sites: 200 devices of 80 measured values each, and 200 ProStars with all their states and bits. The servers are
+processes of their own (metrics_server.py); each format is asked in turn within a round, so that ratios are of one
+minute. Before each scrape all live values change, as polls change them; *unchanged* is a second scrape right after.
+Time is from the request to the last byte read.
 """
 
 from __future__ import annotations
 
-import gzip
+import argparse
+import http.client
+import os
+import platform
 import statistics
+import subprocess
+import sys
 import time
-from collections.abc import Callable
-from types import MappingProxyType
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
 
-from prometheus_client import CollectorRegistry, Gauge
-from prometheus_client.exposition import generate_latest
-from prometheus_client.openmetrics.exposition import generate_latest as generate_openmetrics
-from rich.console import Console
-from rich.table import Table
-
-from gateway.clock import SystemClock
-from gateway.core.settings import LineSettings
-from gateway.core.site import Device, Site
-from gateway.core.snapshot import DeviceState, Snapshot
-from gateway.devices.schema import load_map
-from gateway.faces.http.devices import DeviceCollector
-from gateway.lines.serial import SerialLine
-
-DEVICES = 200
-ROUNDS = 7
+HERE = Path(__file__).parent
+OPENMETRICS = "application/openmetrics-text; version=1.0.0"
+FORMATS = {
+    "text": {"Accept-Encoding": "identity"},
+    "OpenMetrics": {"Accept": OPENMETRICS, "Accept-Encoding": "identity"},
+    "text, gzip": {"Accept-Encoding": "gzip"},
+    "OpenMetrics, gzip": {"Accept": OPENMETRICS, "Accept-Encoding": "gzip"},
+}
+SITES = {"80": "200 devices × 80 measured values", "prostar": "200 ProStars, every state and bit"}
+BAR = 15.0
 
 
-def make_site(clock: SystemClock) -> Site:
-    """A line with 200 online controllers that have a value for every point."""
-    device_map = load_map("prostar-mppt")
-    devices = [Device(f"array-{unit}", unit, unit, device_map) for unit in range(1, DEVICES + 1)]
-    line = SerialLine(LineSettings("shelter-a", 1, "/dev/null"), devices, clock)
-    values = MappingProxyType({point.name: 12.625 if point.unit == "V" else 1 for point in device_map.points})
-    for device in devices:
-        device.snapshot = Snapshot(1, DeviceState.ONLINE, last_reply_at=clock.monotonic(), values=values)
-    return Site.of("ridge-07", [line], devices)
+class Server:
+    """One server process."""
+
+    def __init__(self, which: str, size: str) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, str(HERE / "metrics_server.py"), which, size],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=HERE.parents[1],
+            env={**os.environ, "PYTHONPATH": str(HERE.parents[1])},
+        )
+        self.port = int(self._read())
+
+    def tell(self, line: str) -> str:
+        """Its answer to a command."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{line}\n")
+        self._process.stdin.flush()
+        return self._read()
+
+    def scrape(self, headers: dict[str, str]) -> tuple[float, int]:
+        """Milliseconds of one scrape, and bytes."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        began = time.perf_counter()
+        connection.request("GET", "/metrics", headers=headers)
+        body = connection.getresponse().read()
+        took_ms = (time.perf_counter() - began) * 1000
+        connection.close()
+        return took_ms, len(body)
+
+    def stop(self) -> None:
+        """End it."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait(10)
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+
+    def _read(self) -> str:
+        assert self._process.stdout is not None
+        return self._process.stdout.readline().strip()
 
 
-def peer_registry(ours: CollectorRegistry) -> CollectorRegistry:
-    """The same series as gauges of prometheus-client."""
-    registry = CollectorRegistry()
-    for family in ours.collect():
-        if not family.samples:
-            continue
-        names = list(family.samples[0].labels)
-        metric = Gauge(family.name, family.documentation, names, registry=registry)
-        for sample in family.samples:
-            metric.labels(**sample.labels).set(sample.value)
-    return registry
+@contextmanager
+def both(size: str) -> Iterator[tuple[Server, Server]]:
+    """The gateway and its peer over the same site."""
+    gateway, peer = Server("gateway", size), Server("peer", size)
+    try:
+        yield gateway, peer
+    finally:
+        gateway.stop()
+        peer.stop()
+
+
+def say(text: str) -> None:
+    """Print a line of the report."""
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
+def measure(size: str, rounds: int) -> None:
+    """Print the table of one site."""
+    taken: dict[str, list[tuple[float, float, float, float]]] = {form: [] for form in FORMATS}
+    kilobytes: dict[str, float] = {}
+    with both(size) as (gateway, peer):
+        for headers in FORMATS.values():  # the first scrape writes every line; it is made once after a start
+            gateway.scrape(headers)
+        for _ in range(rounds):
+            for form, headers in FORMATS.items():
+                peer.tell("change")
+                gateway.tell("change")
+                gateway.tell("held")
+                theirs, _ = peer.scrape(headers)
+                changed, size_b = gateway.scrape(headers)
+                held = float(gateway.tell("held"))
+                unchanged, _ = gateway.scrape(headers)
+                taken[form].append((theirs, changed, unchanged, held))
+                kilobytes[form] = size_b / 1000
+        text = http_text(gateway)
+    series = sum(1 for line in text.splitlines() if line and not line.startswith("#"))
+    say(f"\n{SITES[size]}: {series:,} series\n")
+    say("| format | prometheus-client ms | gateway ms | ÷ | unchanged ms | loop held at most ms | kB |")
+    say("|---|---|---|---|---|---|---|")
+    for form, runs in taken.items():
+        theirs, changed, unchanged, held = (statistics.median(column) for column in zip(*runs, strict=True))
+        ratio = statistics.median(run[0] / run[1] for run in runs)
+        mark = "" if ratio >= BAR else f" (bar: {BAR:.0f})"
+        say(
+            f"| {form} | {theirs:.0f} | {changed:.1f} | {ratio:.0f}{mark} | {unchanged:.1f} | {held:.1f} "
+            f"| {kilobytes[form]:,.0f} |"
+        )
+
+
+def http_text(server: Server) -> str:
+    """A whole reply as text."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
+    connection.request("GET", "/metrics", headers=FORMATS["text"])
+    text = connection.getresponse().read().decode()
+    connection.close()
+    return text
 
 
 def main() -> None:
     """Measure and print."""
-    clock = SystemClock()
-    ours = CollectorRegistry()
-    ours.register(DeviceCollector(make_site(clock), clock))
-    peer = peer_registry(ours)
-    works: dict[str, Callable[[], object]] = {
-        "prometheus-client, text": lambda: generate_latest(peer),
-        "text": lambda: generate_latest(ours),
-        "text, gzip": lambda: gzip.compress(generate_latest(ours), 1),
-        "OpenMetrics": lambda: generate_openmetrics(ours),  # type: ignore[no-untyped-call]  # as upstream left it
-    }
-    times: dict[str, list[float]] = {name: [] for name in works}
-    for _ in range(ROUNDS):
-        for name, work in works.items():
-            began = time.perf_counter()
-            work()
-            times[name].append(time.perf_counter() - began)
-    medians = {name: statistics.median(taken) for name, taken in times.items()}
-    series = sum(len(family.samples) for family in ours.collect())
-    table = Table("reply", "median ms", "ratio to the peer", title=f"/metrics: {DEVICES} devices, {series} series")
-    base = medians["prometheus-client, text"]
-    for name, median in medians.items():
-        table.add_row(name, f"{median * 1000:.1f}", f"{median / base:.2f}")
-    Console().print(table)
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--rounds", type=int, default=9)
+    rounds = parser.parse_args().rounds
+    load = os.getloadavg()[0]
+    say(
+        f"## Metrics over HTTP\n\n{datetime.now(UTC):%Y-%m-%d}, {platform.machine()}, {os.cpu_count()} cores, "
+        f"Linux {platform.release().split('-')[0]}, Python {platform.python_version()}; {rounds} rounds, "
+        f"load average {load:.1f}; medians."
+    )
+    for size in SITES:
+        measure(size, rounds)
 
 
 if __name__ == "__main__":

@@ -7,23 +7,21 @@ is dead is seen in `/metrics`.
 
 from __future__ import annotations
 
-import gzip
+import asyncio
 from collections.abc import Callable, Mapping, Sequence
 
-from aiohttp import web
-from prometheus_client import CollectorRegistry, GCCollector, ProcessCollector
-from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, choose_encoder, generate_latest
+from aiohttp import hdrs, web
 
 from gateway.clock import Clock
 from gateway.core.site import Site
 from gateway.core.stats import ModbusServerStats
-from gateway.faces.http.devices import DeviceCollector
+from gateway.faces.http.exposition import Exposition, compressed
 from gateway.faces.http.listener import HttpListener
-from gateway.faces.http.own import Counts, HttpStats, OwnCollector
+from gateway.faces.http.own import Counts, HttpStats
 from gateway.faces.http.page import index_page
 from gateway.faces.http.settings import HttpSettings
+from gateway.faces.http.text import accepts_gzip, negotiate
 
-_GZIP_LEVEL = 1  # a tenth of the size already; higher levels cost the loop more time than they save
 _NO_STORE = {"Cache-Control": "no-store"}
 _PAGE_HEADERS = {
     **_NO_STORE,
@@ -53,11 +51,8 @@ class HttpFace:
         self._clock = clock
         self._not_ready = not_ready
         self.stats = HttpStats()
-        self._registry = CollectorRegistry()
-        self._registry.register(DeviceCollector(site, clock))
-        self._registry.register(OwnCollector(site, clock, Counts(modbus, snmp, self.stats)))
-        ProcessCollector(registry=self._registry)
-        GCCollector(registry=self._registry)
+        self._settings = settings
+        self._exposition = Exposition(site, clock, Counts(modbus, snmp, self.stats, not_ready))
         self.listeners: Sequence[HttpListener] = tuple(
             HttpListener(host, port, self._application, settings, self.stats) for host, port in settings.listen
         )
@@ -70,17 +65,31 @@ class HttpFace:
         application.router.add_get("/readyz", self._readyz)
         return application
 
-    async def _metrics(self, request: web.Request) -> web.Response:
+    async def _metrics(self, request: web.Request) -> web.StreamResponse:
         began = self._clock.monotonic()
-        encode, content_type = _encoder(",".join(request.headers.getall("Accept", [])))
-        body = encode(self._registry)
-        headers = {**_NO_STORE, "Content-Type": content_type, "Vary": "Accept, Accept-Encoding"}
+        form = negotiate(",".join(request.headers.getall("Accept", [])))
+        headers = {**_NO_STORE, "Content-Type": form.content_type, "Vary": "Accept, Accept-Encoding"}
+        pieces = self._exposition.pieces(form)
         if accepts_gzip(",".join(request.headers.getall("Accept-Encoding", []))):
-            body = gzip.compress(body, _GZIP_LEVEL)
             headers["Content-Encoding"] = "gzip"
+            pieces = compressed(pieces)
+        if request.method == hdrs.METH_HEAD:
+            return web.Response(headers=headers)
+        reply = web.StreamResponse(headers=headers)
+        try:
+            async with asyncio.timeout(self._settings.send_timeout_s):
+                await reply.prepare(request)
+                async for piece in pieces:
+                    await reply.write(piece)
+                await reply.write_eof()
+        except TimeoutError:  # it asked, and does not read
+            self.stats.abandoned += 1
+            if request.transport is not None:
+                request.transport.abort()
+            return reply
         self.stats.scrapes += 1
         self.stats.scrape_s += self._clock.monotonic() - began
-        return web.Response(body=body, headers=headers)
+        return reply
 
     async def _healthz(self, _request: web.Request) -> web.Response:
         return web.Response(text="ok\n", headers=_NO_STORE)
@@ -96,24 +105,3 @@ class HttpFace:
     async def _index(self, _request: web.Request) -> web.Response:
         page = index_page(self._site, self._clock.monotonic())
         return web.Response(text=page, content_type="text/html", headers=_PAGE_HEADERS)
-
-
-def _encoder(accept: str) -> tuple[Callable[[CollectorRegistry], bytes], str]:
-    try:
-        return choose_encoder(accept)
-    except (TypeError, ValueError):  # a version that is no number: the format that everybody reads
-        return generate_latest, CONTENT_TYPE_PLAIN_0_0_4
-
-
-def accepts_gzip(accept_encoding: str) -> bool:
-    """Whether an Accept-Encoding header allows gzip (RFC 9110 §12.5.3)."""
-    star = False
-    for item in accept_encoding.split(","):
-        coding, _, parameters = item.partition(";")
-        name, _, weight = parameters.strip().partition("=")
-        refused = name.strip().lower() == "q" and not weight.strip(" 0.")
-        coding = coding.strip().lower()
-        if coding in {"gzip", "x-gzip"}:
-            return not refused
-        star = star or (coding == "*" and not refused)
-    return star

@@ -6,24 +6,29 @@ that no line in a graph goes on flat. What says so (`morningstar_up`, the state,
 An enumeration is one series a state with the label `state`, 1 for the one that holds, else 0. A bit field is
 one series a named bit with the label `bit`. A number or a set bit that the map does not name has a series
 while it lasts (`value_17`, `bit_9`), so that it cannot pass unseen.
+
+A scrape costs what has changed: a device's lines are kept, and when its snapshot was replaced only those of
+points whose value is another one are written anew. All lines of a device in one scrape are of one snapshot.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Protocol
 
-from prometheus_client.metrics_core import Metric
-
-from gateway.clock import Clock
+from gateway.core.polling import IDENTITY_MISMATCH, NOT_REWRITTEN
 from gateway.core.site import Device, Site
-from gateway.core.snapshot import DeviceState
+from gateway.core.snapshot import DeviceState, Snapshot
 from gateway.devices.model import DeviceMap, Point, Value
 from gateway.errors import MapError
-from gateway.faces.http.metric import MetricInfo, MetricKind, Sample, gauge
+from gateway.faces.http.metric import Labels, MetricInfo, MetricKind, gauge
+from gateway.faces.http.text import Lines, escaped, label_pairs, number, sample_lines
 
-DEVICE_LABELS = ("site", "line", "device", "unit_id", "model")
+DEVICE_LABELS = ("device", "line", "model", "site", "unit_id")
 """Every metric of a device has these labels, first and in this order."""
+
+CONDITIONS = (IDENTITY_MISMATCH, NOT_REWRITTEN)
+"""Conditions that have a series from the start, so that the first time is a rise."""
 
 UP = gauge("morningstar_up", "1 while the controller is online, 0 while it is not.", *DEVICE_LABELS)
 AGE = gauge(
@@ -46,13 +51,19 @@ INFO = gauge(
     "revision",
     "serial_number",
 )
-DEVICE_METRICS = (UP, AGE, STATE, INFO)
+CONDITION = gauge(
+    "morningstar_condition",
+    "1 while the gateway sees this condition of the controller.",
+    *DEVICE_LABELS,
+    "condition",
+)
+DEVICE_METRICS = (UP, AGE, STATE, INFO, CONDITION)
 """The metrics of a device that come from no register."""
 
 
-def device_labels(site: Site, device: Device) -> tuple[str, ...]:
+def device_labels(site: Site, device: Device) -> Labels:
     """The values of `DEVICE_LABELS`."""
-    return (site.name, device.line.name, device.name, str(device.unit_id), device.map.model)
+    return (device.name, device.line.name, device.map.model, site.name, str(device.unit_id))
 
 
 def point_metric(point: Point) -> MetricInfo | None:
@@ -68,105 +79,167 @@ def point_metric(point: Point) -> MetricInfo | None:
     return MetricInfo(point.metric, kind, point.help, labels)
 
 
-class _Series(Protocol):
-    """The series of one point of one device."""
+class _Writer(Protocol):
+    """How one point of a model becomes lines."""
 
-    def samples(self, value: Value) -> Iterable[Sample]:
-        """The samples of the point's present value."""
+    def lines(self, labels: bytes, value: Value) -> bytes:
+        """The lines of the point's present value; `labels` are the device's."""
         ...
 
 
 class _Number:
-    def __init__(self, labels: tuple[str, ...], scale: float) -> None:
-        self._labels = labels
+    def __init__(self, metric: str, scale: float) -> None:
+        self._begin = f"{metric}{{".encode()
         self._scale = scale
 
-    def samples(self, value: Value) -> Iterable[Sample]:
-        return ((self._labels, value * self._scale),)
+    def lines(self, labels: bytes, value: Value) -> bytes:
+        return self._begin + labels + b"}" + number(value * self._scale)
 
 
 class _OneOf:
-    def __init__(self, labels: tuple[str, ...], names: Mapping[int, str]) -> None:
-        self._labels = labels
-        self._states = {number: (*labels, name) for number, name in names.items()}
+    def __init__(self, metric: str, names: Mapping[int, str]) -> None:
+        self._begin = f"{metric}{{".encode()
+        self._names = {code: escaped(name).encode() for code, name in names.items()}
 
-    def samples(self, value: Value) -> Iterator[Sample]:
-        for number, labels in self._states.items():
-            yield labels, float(number == value)
-        if value not in self._states:
-            yield (*self._labels, f"value_{int(value)}"), 1.0
+    def lines(self, labels: bytes, value: Value) -> bytes:
+        begin = b'%b%b,state="' % (self._begin, labels)
+        out = [b'%b%b"} %d.0\n' % (begin, name, code == value) for code, name in self._names.items()]
+        if value not in self._names:
+            out.append(b'%bvalue_%d"} 1.0\n' % (begin, int(value)))
+        return b"".join(out)
 
 
 class _Bits:
-    def __init__(self, labels: tuple[str, ...], names: Mapping[int, str]) -> None:
-        self._labels = labels
-        self._bits = {number: (*labels, name) for number, name in names.items()}
+    def __init__(self, metric: str, names: Mapping[int, str]) -> None:
+        self._begin = f"{metric}{{".encode()
+        self._names = {bit: escaped(name).encode() for bit, name in names.items()}
 
-    def samples(self, value: Value) -> Iterator[Sample]:
+    def lines(self, labels: bytes, value: Value) -> bytes:
         bits = int(value)
-        for number, labels in self._bits.items():
-            yield labels, float(bits >> number & 1)
-        for number in range(bits.bit_length()):
-            if bits >> number & 1 and number not in self._bits:
-                yield (*self._labels, f"bit_{number}"), 1.0
+        begin = b'%b%b,bit="' % (self._begin, labels)
+        named = [b'%b%b"} %d.0\n' % (begin, name, bits >> bit & 1) for bit, name in self._names.items()]
+        unnamed = [
+            b'%bbit_%d"} 1.0\n' % (begin, bit)
+            for bit in range(bits.bit_length())
+            if bits >> bit & 1 and bit not in self._names
+        ]
+        return b"".join(named + unnamed)
 
 
-def _series(model: DeviceMap, point: Point, labels: tuple[str, ...]) -> _Series:
+def _writer(model: DeviceMap, point: Point, metric: str) -> _Writer:
     if point.enumeration is not None:
-        return _OneOf(labels, {entry.number: entry.name for entry in model.enumerations[point.enumeration]})
+        return _OneOf(metric, {entry.number: entry.name for entry in model.enumerations[point.enumeration]})
     if point.bits is not None:
-        return _Bits(labels, {bit.number: bit.name for bit in model.bit_tables[point.bits]})
-    return _Number(labels, point.metric_scale)
+        return _Bits(metric, {bit.number: bit.name for bit in model.bit_tables[point.bits]})
+    return _Number(metric, point.metric_scale)
 
 
-class DeviceCollector:
-    """Collects every device of a site from its snapshot; never asks a line."""
+_Plan = tuple[tuple[int, str, _Writer], ...]
+"""Of one model: index of the family, name of the point, how it is written."""
 
-    def __init__(self, site: Site, clock: Clock) -> None:
-        """Prepare all series; MapError when two models give one metric name different labels or types."""
-        self._clock = clock
-        self._devices = [(device, device_labels(site, device)) for device in site.devices]
-        self._infos: dict[str, MetricInfo] = {}
-        self._series: dict[str, list[tuple[int, str, _Series]]] = {}  # metric → (index of device, point, its series)
-        for index, (device, labels) in enumerate(self._devices):
-            for point in device.map.points:
-                self._add(index, device.map, labels, point)
 
-    def _add(self, index: int, model: DeviceMap, labels: tuple[str, ...], point: Point) -> None:
-        info = point_metric(point)
-        if info is None:
-            return
-        known = self._infos.setdefault(info.name, info)
-        if (known.kind, known.labels) != (info.kind, info.labels):
-            raise MapError(f"{model.model}: point {point.name}: metric {info.name} has other labels elsewhere")
-        self._series.setdefault(info.name, []).append((index, point.name, _series(model, point, labels)))
+class _DeviceLines:
+    """The lines of one device, kept from scrape to scrape."""
 
-    def collect(self) -> Iterator[Metric]:
-        """All metrics that have a sample now; each device's from one snapshot."""
-        now = self._clock.monotonic()
-        seen = [(device.snapshot, labels) for device, labels in self._devices]
-        yield UP.family((labels, float(snapshot.state is DeviceState.ONLINE)) for snapshot, labels in seen)
-        yield AGE.family(
-            (labels, max(0.0, now - snapshot.last_reply_at))
-            for snapshot, labels in seen
-            if snapshot.last_reply_at is not None
-        )
-        yield STATE.family(
-            ((*labels, state.value), float(snapshot.state is state))
-            for snapshot, labels in seen
-            for state in DeviceState
-        )
-        yield INFO.family(
-            ((*labels, says.vendor, says.product, says.revision, snapshot.serial_number or ""), 1.0)
-            for snapshot, labels in seen
-            if (says := snapshot.identification) is not None
-        )
-        shown = [snapshot.shown() for snapshot, _ in seen]
-        for name, entries in self._series.items():
-            samples: list[Sample] = []
-            for index, point, series in entries:
-                value = shown[index].get(point)
-                if value is not None:
-                    samples.extend(series.samples(value))
-            if samples:
-                yield self._infos[name].family(samples)
+    def __init__(self, device: Device, labels: bytes, plan: _Plan, families: int) -> None:
+        self.device = device
+        self.labels = labels
+        self._plan = plan
+        self._values: list[Value | None] = [None] * len(plan)
+        self._lines: Lines = (b"",) * families
+        self._written: Snapshot | None = None
+
+    def of_now(self) -> Lines:
+        """The lines of the present snapshot; never changed afterwards."""
+        snapshot = self.device.snapshot
+        if snapshot is self._written:
+            return self._lines
+        lines = list(self._lines)
+        before = self._written
+        if before is None or _status(before) != _status(snapshot):
+            lines[: len(DEVICE_METRICS)] = _status_lines(self.labels, snapshot)
+        shown, values = snapshot.shown(), self._values
+        for index, (family, point, writer) in enumerate(self._plan):
+            value = shown.get(point)
+            if value != values[index]:
+                values[index] = value
+                lines[family] = b"" if value is None else writer.lines(self.labels, value)
+        self._written = snapshot
+        self._lines = lines
+        return lines
+
+
+def _status(snapshot: Snapshot) -> tuple[object, ...]:
+    return (snapshot.state, snapshot.identification, snapshot.serial_number, snapshot.warnings)
+
+
+def _status_lines(labels: bytes, snapshot: Snapshot) -> list[bytes]:
+    """The lines of `DEVICE_METRICS`; the age is not among them, for it changes without a snapshot."""
+    state = snapshot.state
+    states = (
+        sample_lines(STATE, b'%b,state="%b"' % (labels, each.value.encode()), each is state) for each in DeviceState
+    )
+    says = snapshot.identification
+    info = b""
+    if says is not None:
+        texts = (says.vendor, says.product, says.revision, snapshot.serial_number or "")
+        info = sample_lines(INFO, labels + b"," + label_pairs(INFO.labels[len(DEVICE_LABELS) :], texts), 1)
+    conditions = (
+        sample_lines(CONDITION, labels + b"," + label_pairs(("condition",), (each,)), each in snapshot.warnings)
+        for each in dict.fromkeys((*CONDITIONS, *sorted(snapshot.warnings)))
+    )
+    up = sample_lines(UP, labels, state is DeviceState.ONLINE)
+    return [up, b"", b"".join(states), info, b"".join(conditions)]
+
+
+class DeviceMetrics:
+    """Every device of a site, from its snapshot; never asks a line."""
+
+    def __init__(self, site: Site) -> None:
+        """Prepare all families; MapError when two models give one metric name different labels or types."""
+        self._families: dict[str, MetricInfo] = {info.name: info for info in DEVICE_METRICS}
+        plans = {
+            model.model: self._plan(model)
+            for model in {device.map.model: device.map for device in site.devices}.values()
+        }
+        self._devices = [
+            _DeviceLines(
+                device,
+                label_pairs(DEVICE_LABELS, device_labels(site, device)),
+                plans[device.map.model],
+                len(self._families),
+            )
+            for device in site.devices
+        ]
+
+    def _plan(self, model: DeviceMap) -> _Plan:
+        plan = []
+        for point in model.points:
+            info = point_metric(point)
+            if info is None:
+                continue
+            known = self._families.setdefault(info.name, info)
+            if (known.kind, known.labels) != (info.kind, info.labels):
+                raise MapError(f"{model.model}: point {point.name}: metric {info.name} has other labels elsewhere")
+            plan.append((list(self._families).index(info.name), point.name, _writer(model, point, info.name)))
+        return tuple(plan)
+
+    def write(self) -> Iterator[Lines]:
+        """Each device's lines, written as far as they changed; a step of the iteration is one device."""
+        for lines in self._devices:
+            yield lines.of_now()
+
+    def families(self, written: Sequence[Lines], now: float) -> Iterator[tuple[MetricInfo, Lines]]:
+        """Each family that has samples with the lines of all devices; `written` is what `write` gave."""
+        ages = self._ages(now)
+        for info, *lines in zip(self._families.values(), *written, strict=True):
+            present = ages if info is AGE else lines
+            if any(present):
+                yield info, present
+
+    def _ages(self, now: float) -> Lines:
+        return [
+            sample_lines(AGE, each.labels, max(0.0, now - at))
+            for each in self._devices
+            if (at := each.device.snapshot.last_reply_at) is not None
+        ]

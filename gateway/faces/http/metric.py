@@ -6,15 +6,18 @@ the reply to a scrape. A name is written as it is scraped: counters end in `_tot
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
-from prometheus_client.metrics_core import Metric
+from gateway.devices.units import UNITS
 
-Sample = tuple[tuple[str, ...], float]
-"""Label values, in the order of the metric's label names, and the number."""
+Labels = tuple[str, ...]
+"""Label values, in the order of the metric's label names."""
+
+BASE_UNITS = tuple(
+    sorted({unit.metric_suffix for unit in UNITS.values() if unit.metric_suffix} | {"bytes"}, key=len, reverse=True)
+)
+"""Units by which a metric's name may end, the longest first."""
 
 
 class MetricKind(StrEnum):
@@ -22,6 +25,7 @@ class MetricKind(StrEnum):
 
     GAUGE = "gauge"
     COUNTER = "counter"
+    HISTOGRAM = "histogram"
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,16 +37,15 @@ class MetricInfo:
     help: str
     labels: tuple[str, ...] = ()
 
-    def family(self, samples: Iterable[Sample]) -> Metric:
-        """The metric with its samples, as prometheus-client writes it out."""
-        family: CounterMetricFamily | GaugeMetricFamily
-        if self.kind is MetricKind.COUNTER:
-            family = CounterMetricFamily(self.name, self.help, labels=self.labels)
-        else:
-            family = GaugeMetricFamily(self.name, self.help, labels=self.labels)
-        for labels, value in samples:
-            family.add_metric(labels, value)
-        return family
+    @property
+    def family(self) -> str:
+        """The name of the metric family in OpenMetrics: without a counter's `_total`."""
+        return self.name.removesuffix("_total") if self.kind is MetricKind.COUNTER else self.name
+
+    @property
+    def unit(self) -> str:
+        """The base unit that the family's name ends by; "" for a number without one."""
+        return next((unit for unit in BASE_UNITS if self.family.endswith(f"_{unit}")), "")
 
 
 def gauge(name: str, help_text: str, *labels: str) -> MetricInfo:
@@ -53,3 +56,8 @@ def gauge(name: str, help_text: str, *labels: str) -> MetricInfo:
 def counter(name: str, help_text: str, *labels: str) -> MetricInfo:
     """Describe a counter; `name` ends in `_total`."""
     return MetricInfo(name, MetricKind.COUNTER, help_text, labels)
+
+
+def histogram(name: str, help_text: str, *labels: str) -> MetricInfo:
+    """Describe a histogram; `name` ends in its unit."""
+    return MetricInfo(name, MetricKind.HISTOGRAM, help_text, labels)

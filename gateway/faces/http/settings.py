@@ -13,3 +13,4 @@ class HttpSettings:
     max_connections: int = 16  # per listener; over it the oldest one that has no request under way is closed
     idle_timeout_s: float = 5.0  # time for a request's header, and between two requests of a connection
     stop_grace_s: float = 1.0  # how long a stopping listener waits for replies under way
+    send_timeout_s: float = 30.0  # time for a scraper to take a whole reply

@@ -10,8 +10,11 @@ import pytest
 from gateway import __version__
 from gateway.core.site import LineState, Site
 from gateway.core.stats import ModbusServerStats
+from gateway.faces.http.exposition import Exposition
+from gateway.faces.http.lines import ERROR_KINDS
 from gateway.faces.http.metric import MetricInfo, MetricKind
-from gateway.faces.http.own import ERROR_KINDS, OWN_METRICS, Counts, HttpStats, OwnCollector
+from gateway.faces.http.own import OWN_METRICS, Counts, HttpStats
+from tests.faces.http.scrapes import parse, scrape
 
 from .conftest import ManualClock, UnreadableLine
 
@@ -20,7 +23,7 @@ def sample(site: Site, clock: ManualClock, counts: Counts, name: str, **labels: 
     """The one sample of that name and (at least) those labels."""
     [value] = [
         sample.value
-        for family in OwnCollector(site, clock, counts).collect()
+        for family in parse(scrape(Exposition(site, clock, counts)))
         for sample in family.samples
         if sample.name == name and labels.items() <= sample.labels.items()
     ]
@@ -83,9 +86,9 @@ def test_face_counters(site: Site, clock: ManualClock) -> None:
 
 
 def test_version_and_start(site: Site, clock: ManualClock) -> None:
-    collector = OwnCollector(site, clock, Counts())
+    exposition = Exposition(site, clock, Counts())
     clock.date += 60
-    found = {sample.name: sample for family in collector.collect() for sample in family.samples}
+    found = {sample.name: sample for family in parse(scrape(exposition)) for sample in family.samples}
     assert found["prostar_gateway_build_info"].labels["version"] == __version__
     assert found["prostar_gateway_start_time_seconds"].value == clock.date - 60
 
@@ -95,15 +98,45 @@ def test_what_is_collected_is_what_is_described(site: Site, clock: ManualClock) 
     modbus.exceptions[2] = 1
     for reasons in (modbus.malformed, modbus.refused, modbus.closed):
         reasons["because"] = 1
-    collector = OwnCollector(site, clock, Counts(modbus, lambda: {"get": 1}))
+    line, device = site.lines[0], site.devices[0]
+    line.stats.seconds_by_client["10.0.0.1"] = 1.0
+    device.stats.refresh_s = 1.0
+    exposition = Exposition(site, clock, Counts(modbus, lambda: {"get": 1}))
 
-    def collected() -> Iterator[tuple[str, str, str, tuple[str, ...]]]:
-        for family in collector.collect():
-            labels = {tuple(sample.labels) for sample in family.samples}
-            assert len(labels) == 1, f"{family.name} has samples with differing labels, or none"
-            yield family.samples[0].name, family.type, family.documentation, labels.pop()
+    def collected() -> Iterator[tuple[str, str, str, set[str]]]:
+        for family in parse(scrape(exposition)):
+            if family.name.startswith("prostar_gateway"):
+                labels = {frozenset(sample.labels.keys() - {"le"}) for sample in family.samples}
+                assert len(labels) == 1, f"{family.name} has samples with differing labels, or none"
+                total = "_total" if family.type == "counter" else ""
+                yield family.name + total, family.type, family.documentation, set(labels.pop())
 
-    assert list(collected()) == [(info.name, info.kind.value, info.help, info.labels) for info in OWN_METRICS]
+    assert list(collected()) == [(info.name, info.kind.value, info.help, set(info.labels)) for info in OWN_METRICS]
+
+
+def test_where_the_time_of_a_line_goes(site: Site, clock: ManualClock) -> None:
+    stats = site.lines[0].stats
+    stats.seconds_by_purpose["poll"] = 12.5
+    stats.seconds_by_client["10.0.0.1"] = 0.5
+    stats.queue_wait.observe(0.02)
+    site.devices[0].stats.errors["crc"] = 3
+    for name, labels, value in (
+        ("line_purpose_seconds_total", {"line": "shelter-a", "purpose": "poll"}, 12.5),
+        ("line_purpose_seconds_total", {"line": "shelter-a", "purpose": "write"}, 0),
+        ("line_client_seconds_total", {"client": "10.0.0.1"}, 0.5),
+        ("line_queue_wait_seconds_bucket", {"line": "shelter-a", "le": "0.025"}, 1),
+        ("line_queue_wait_seconds_bucket", {"line": "shelter-a", "le": "0.01"}, 0),
+        ("line_queue_wait_seconds_count", {"line": "shelter-a"}, 1),
+        ("line_stretch_ratio", {"line": "shelter-a"}, 1),
+        ("device_errors_total", {"device": "array-1", "kind": "crc"}, 3),
+        ("device_errors_total", {"device": "array-2", "kind": "timeout"}, 0),
+    ):
+        assert sample(site, clock, Counts(), f"prostar_gateway_{name}", **labels) == value
+
+
+def test_ready_is_what_readyz_says(site: Site, clock: ManualClock) -> None:
+    assert sample(site, clock, Counts(), "prostar_gateway_ready") == 1
+    assert sample(site, clock, Counts(not_ready=lambda: ["no port"]), "prostar_gateway_ready") == 0
 
 
 @pytest.mark.parametrize("info", OWN_METRICS, ids=lambda info: info.name)

@@ -1,0 +1,198 @@
+"""Ours beside prometheus-client's own rendering of the same registry, in both formats; and that nothing is held up."""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from prometheus_client.exposition import generate_latest
+from prometheus_client.openmetrics.exposition import generate_latest as generate_openmetrics
+
+from gateway.core.site import Site
+from gateway.core.snapshot import DeviceState, Snapshot
+from gateway.core.stats import ModbusServerStats
+from gateway.devices.schema import load_map, models
+from gateway.faces.http.exposition import DEVICES_A_TURN, PIECE_BYTES, Exposition, compressed
+from gateway.faces.http.own import Counts, HttpStats
+from gateway.faces.http.text import OPENMETRICS, TEXT, Format
+from tests.faces.http.reference import registry
+from tests.faces.http.scrapes import Seen, joined, parse, scrape, seen
+
+from .conftest import VALUES, ManualClock, UnreadableLine, make_device, online
+
+FORMATS = pytest.mark.parametrize("form", [TEXT, OPENMETRICS], ids=["text", "openmetrics"])
+
+
+def rendered_by_the_client(site: Site, clock: ManualClock, counts: Counts, form: Format) -> bytes:
+    kept = registry(site, clock, counts, clock.wall())
+    if form.openmetrics:
+        text: bytes = generate_openmetrics(kept)  # type: ignore[no-untyped-call]  # as upstream left it
+        return text
+    return generate_latest(kept)
+
+
+def described(text: bytes, form: Format) -> set[tuple[str, str, str, str]]:
+    """Name, type, unit and help of every family."""
+    return {(family.name, family.type, family.unit, family.documentation) for family in parse(text, form)}
+
+
+def without_process(samples: Seen) -> Seen:
+    """Processor time and memory differ between two scrapes."""
+    return {key: value for key, value in samples.items() if not key[0].startswith(("process_", "python_"))}
+
+
+def busy_counts() -> Counts:
+    modbus = ModbusServerStats(requests=7)
+    modbus.exceptions[0x0B] = 4
+    modbus.malformed['a "b"\\\n'] = 1
+    return Counts(modbus, lambda: {"bad_community": 6}, HttpStats(scrapes=5, scrape_s=0.123456789), lambda: ["no"])
+
+
+def busy_site(clock: ManualClock, model: str) -> Site:
+    """Every point of a map with values of all sorts, names that need escaping, all states, histograms, conditions."""
+    device_map = load_map(model)
+    lines = [UnreadableLine('with "quotes", \\ and\nlines'), UnreadableLine("日本", index=2)]
+    lines[0].stats.queue_wait.observe(0.003)
+    lines[0].stats.queue_wait.observe(99)
+    lines[0].stats.reply_time.observe(0.2)
+    lines[0].stats.seconds_by_client["10.0.0.1"] = 1.5
+    lines[0].stats.failed["offline"] = 3
+    devices = [make_device(f"array-{unit}", unit, lines[unit % 2], device_map) for unit in range(1, 8)]
+    values = (1, 0, 3, 1e9, -12.625, 4294967295)
+    for device, value, state in zip(
+        devices, values, (*DeviceState, DeviceState.ONLINE, DeviceState.ONLINE), strict=False
+    ):
+        device.snapshot = online(
+            clock.now - value % 7,
+            state=state,
+            values={
+                point.name: value if point.unit and point.metric_type == "gauge" else abs(int(value))
+                for point in device_map.points
+            },
+            warnings=frozenset({"identity_mismatch", "history_late"}) if value == 3 else frozenset(),
+        )
+    devices[1].stats.errors["crc"] = 2
+    devices[1].stats.refresh_s = 1.0625
+    return Site.of('Berg\\hütte "7"\n日本', lines, devices)
+
+
+@FORMATS
+@pytest.mark.parametrize("model", models())
+def test_same_samples_as_prometheus_client(model: str, form: Format, clock: ManualClock) -> None:
+    site, counts = busy_site(clock, model), busy_counts()
+    exposition = Exposition(site, clock, counts)
+    ours, theirs = scrape(exposition, form), rendered_by_the_client(site, clock, counts, form)
+    assert without_process(seen(parse(ours, form))) == without_process(seen(parse(theirs, form)))
+    assert len(seen(parse(ours, form))) > 1000
+    assert described(ours, form) == described(theirs, form)
+
+
+@FORMATS
+def test_same_samples_after_every_kind_of_change(form: Format, site: Site, clock: ManualClock) -> None:
+    counts = Counts()
+    exposition = Exposition(site, clock, counts)
+    first = online(clock.now)
+    for snapshot in (
+        Snapshot(),
+        first,
+        replace(first, values={**VALUES, "battery_voltage": 13.25, "charge_state": 0, "array_fault": 1 << 9}),
+        replace(first, values={"energy": 3}),
+        replace(first, state=DeviceState.STALE),
+        replace(first, serial_number=None, warnings=frozenset({"identity_mismatch"})),
+        replace(first, last_reply_at=clock.now + 5),
+        replace(first, identification=None),
+    ):
+        site.devices[0].snapshot = snapshot
+        clock.now += 7
+        ours = seen(parse(scrape(exposition, form), form))
+        theirs = seen(parse(rendered_by_the_client(site, clock, counts, form), form))
+        assert without_process(ours) == without_process(theirs)
+
+
+@given(
+    names=st.tuples(*[st.text(st.characters(exclude_categories=["Cs", "Cc"]) | st.just("\n"), min_size=1)] * 3),
+    value=st.floats(),
+    form=st.sampled_from([TEXT, OPENMETRICS]),
+)
+def test_any_name_and_any_number_is_read_back(names: tuple[str, str, str], value: float, form: Format) -> None:  # F70
+    clock = ManualClock()
+    line = UnreadableLine(names[1])
+    device = make_device(names[2], 1, line)
+    device.snapshot = online(clock.now, values={"battery_voltage": value})
+    text = scrape(Exposition(Site.of(names[0], [line], [device]), clock, Counts()), form)
+    [found] = [family for family in parse(text, form) if family.name == "morningstar_battery_voltage_volts"]
+    [sample] = found.samples
+    assert [sample.labels[label] for label in ("site", "line", "device")] == list(names)
+    assert sample.value == value or (sample.value != sample.value and value != value)  # noqa: PLR0124  NaN alone is not itself
+
+
+def large_site(clock: ManualClock, count: int) -> Site:
+    line = UnreadableLine("shelter-a")
+    device_map = load_map(models()[0])
+    devices = [make_device(f"array-{unit}", unit, line, device_map) for unit in range(1, count + 1)]
+    for device in devices:
+        device.snapshot = online(clock.now, values={point.name: 1 for point in device_map.points})
+    return Site.of("ridge-07", [line], devices)
+
+
+async def test_a_large_scrape_gives_way_to_others(clock: ManualClock) -> None:
+    exposition = Exposition(large_site(clock, 100), clock, Counts())
+    turns = 0
+
+    async def others() -> None:
+        nonlocal turns
+        while True:
+            turns += 1
+            await asyncio.sleep(0)
+
+    other = asyncio.create_task(others())
+    pieces = [len(piece) async for piece in exposition.pieces(TEXT)]
+    other.cancel()
+    largest_family = 50 * 1024 * 10  # 27 alarms of 100 devices, a line of 150 bytes each
+    assert all(PIECE_BYTES <= piece < PIECE_BYTES + largest_family for piece in pieces[:-1])
+    assert len(pieces) > 10
+    assert turns >= 100 // DEVICES_A_TURN + len(pieces) - 1
+
+
+async def test_a_poll_during_a_scrape_changes_nothing_of_it(clock: ManualClock) -> None:
+    site = large_site(clock, 100)
+    exposition = Exposition(site, clock, Counts())
+    pieces = exposition.pieces(TEXT)
+    begin = await anext(pieces)
+    for device in site.devices:
+        device.snapshot = online(clock.now, values=dict.fromkeys(device.snapshot.values, 0))
+    found = seen(parse(begin + await joined(pieces)))
+    changed = [value for (name, _), value in found.items() if name == "morningstar_hourmeter_seconds_total"]
+    assert changed == [3600.0] * 100
+    again = seen(parse(await joined(exposition.pieces(TEXT))))
+    assert [value for (name, _), value in again.items() if name == "morningstar_hourmeter_seconds_total"] == [0.0] * 100
+
+
+async def test_gzip_in_pieces_is_one_stream(clock: ManualClock) -> None:
+    exposition = Exposition(large_site(clock, 30), clock, Counts())
+    packed = [piece async for piece in compressed(exposition.pieces(TEXT))]
+    assert len(packed) > 2
+    whole = gzip.decompress(b"".join(packed))
+    assert seen(parse(whole)).keys() == seen(parse(await joined(exposition.pieces(TEXT)))).keys()
+
+
+def test_units_are_told_and_the_names_end_by_them(clock: ManualClock) -> None:
+    text = scrape(Exposition(busy_site(clock, models()[0]), clock, Counts()), OPENMETRICS)
+    units = dict(line.split()[2:4] for line in text.decode().splitlines() if line.startswith("# UNIT"))
+    assert units["morningstar_battery_voltage_volts"] == "volts"
+    assert units["morningstar_charge_energy_watthours"] == "watthours"
+    assert units["morningstar_hourmeter_seconds"] == "seconds"
+    assert units["morningstar_temperature_compensation_volts_per_celsius"] == "volts_per_celsius"
+    assert units["prostar_gateway_line_discarded_bytes"] == "bytes"
+    assert all(name.endswith(f"_{unit}") for name, unit in units.items())
+    assert "morningstar_charge_state" not in units
+
+
+def test_a_site_without_devices_is_scraped(clock: ManualClock) -> None:
+    found = parse(scrape(Exposition(Site.of("ridge-07", [], []), clock, Counts())))
+    assert "prostar_gateway_build_info" in {family.name for family in found}
+    assert not [family for family in found if family.name.startswith("morningstar_")]
