@@ -12,6 +12,7 @@ from gateway.faces.http.settings import HttpSettings
 from gateway.faces.modbus import connection
 from gateway.faces.modbus.settings import ModbusSettings
 from gateway.faces.snmp import responder
+from gateway.faces.snmp.settings import REPLY_LIMIT
 from gateway.lines import serial
 from gateway.service import supervisor
 from gateway.service.settings import STOP_GRACE_S
@@ -54,7 +55,7 @@ def test_every_row_has_a_test() -> None:
         ("replies or {} bytes", connection.MAX_UNSENT),
         ("closed after {} s", MODBUS.write_timeout_s),
         ("| SNMP request | {} bytes |", responder.DATAGRAM_LIMIT),
-        ("| SNMP reply | {} bytes |", responder.REPLY_LIMIT),
+        ("| SNMP reply | {} bytes |", REPLY_LIMIT),
         ("| HTTP connections of an address | {} |", HTTP.max_connections),
         ("| HTTP request header | {} s |", HTTP.idle_timeout_s),
         (

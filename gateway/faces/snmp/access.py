@@ -1,22 +1,31 @@
-"""Who may read. There is no way to grant anything else.
+"""Who may read what. There is no way to grant anything else.
 
 The decision is ours and explicit, made before a message is decoded: pysnmp's own access control answers "in view"
 when a view has no entries. Here the rule is one look-up that ends in "no" unless an entry says otherwise:
 
-1. An address that no community lists is refused; its datagram is not looked at.
-2. A community is accepted only from its own networks; an unknown name, and a known name from elsewhere, are the
+1. An address that no credential lists is refused; its datagram is not looked at.
+2. A community or user is accepted only from its own networks; an unknown name, and a known name from elsewhere, are the
    same refusal.
-3. An accepted community reads the one tree of the gateway. Nobody writes.
+3. What a credential may read is a mapping from contexts to windows: lists of cells from which everything
+   outside of its view is missing. There is nothing else that it could be led to. Nobody writes.
+4. What is kept of an address is bounded: SOURCES_KEPT of them, the longest known forgotten first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from ipaddress import IPv4Address, IPv6Address, ip_address
 
-from gateway.faces.snmp.settings import Community, Network
+from gateway.faces.snmp.settings import Community, Network, User, View
+from gateway.faces.snmp.tree import Window
 
 Address = IPv4Address | IPv6Address
+Windows = Mapping[bytes, Window]
+"""What a credential may read, by context; "" is the default context."""
+
+SOURCES_KEPT = 1024
+BURST_S = 10.0
+"""A source may use this much of its allowance at once."""
 
 
 def source_address(host: str) -> Address:
@@ -27,23 +36,74 @@ def source_address(host: str) -> Address:
     return address
 
 
+class Source:
+    """An address that may ask, and what it may use."""
+
+    __slots__ = ("_at", "_left", "_most", "_rate", "communities", "host", "users")
+
+    def __init__(
+        self, host: str, communities: Mapping[bytes, Windows], users: Mapping[bytes, Windows], rate: float
+    ) -> None:
+        self.host = host
+        self.communities = communities
+        self.users = users
+        self._rate = rate
+        self._most = self._left = max(1.0, rate * BURST_S)
+        self._at = 0.0
+
+    def take(self, now: float) -> bool:
+        """Use up one request of the allowance; False when there is none left."""
+        left = self._left + (now - self._at) * self._rate
+        self._at = now
+        if left >= self._most:
+            left = self._most
+        elif left < 1.0:
+            self._left = left
+            return False
+        self._left = left - 1.0
+        return True
+
+
 class Access:
-    """The communities with their networks."""
+    """The credentials with their networks and windows."""
 
-    def __init__(self, communities: Iterable[Community]) -> None:
-        self._networks: dict[bytes, tuple[Network, ...]] = {}
-        for community in communities:
-            name = community.name.encode()
-            self._networks[name] = self._networks.get(name, ()) + community.sources
+    def __init__(
+        self,
+        communities: Iterable[Community],
+        users: Iterable[User],
+        windows: Callable[[View], Windows],
+        requests_per_s: float,
+    ) -> None:
+        """`windows` gives what a view shows."""
+        self._communities = [(each.name.encode(), each.sources, windows(each.view)) for each in communities]
+        self._users = [(each.credentials.name, each.sources, windows(each.view)) for each in users]
+        self._requests_per_s = requests_per_s
+        self._known: dict[str, Source | None] = {}
 
-    def listed(self, source: Address) -> bool:
-        """Whether any community may be used from `source`."""
-        return any(_inside(source, networks) for networks in self._networks.values())
+    def source(self, host: str) -> Source | None:
+        """What may be used from `host`, None when nothing."""
+        try:
+            return self._known[host]
+        except KeyError:
+            return self._learn(host)
 
-    def may_read(self, community: bytes, source: Address) -> bool:
-        """Whether this community may read from this address."""
-        return _inside(source, self._networks.get(community, ()))
+    def _learn(self, host: str) -> Source | None:
+        address = source_address(host)
+        communities = _usable(self._communities, address)
+        users = _usable(self._users, address)
+        source = Source(host, communities, users, self._requests_per_s) if communities or users else None
+        if len(self._known) >= SOURCES_KEPT:
+            del self._known[next(iter(self._known))]
+        self._known[host] = source
+        return source
 
 
-def _inside(source: Address, networks: tuple[Network, ...]) -> bool:
-    return any(source in network for network in networks)
+def _usable(
+    credentials: Iterable[tuple[bytes, tuple[Network, ...], Windows]], address: Address
+) -> dict[bytes, Windows]:
+    """Of a name that is given twice, the first that lists the address counts."""
+    usable: dict[bytes, Windows] = {}
+    for name, networks, windows in credentials:
+        if any(address in network for network in networks):
+            usable.setdefault(name, windows)
+    return usable

@@ -1,7 +1,9 @@
-"""The SNMP agent's sockets: UDP, IPv4 and IPv6, SNMPv2c, read-only.
+"""The SNMP agent's sockets: UDP, IPv4 and IPv6; SNMPv1, v2c and v3; read-only.
 
-A datagram is answered where it arrives, without a queue or a task: `responder.py` needs well under a millisecond and
-never waits. The sockets are bound by ourselves, so that a taken port is an error with a name.
+1. A datagram is answered where it arrives, without a queue or a task: `responder.py` never waits. Those that wait in
+   the socket are answered together, for at most TURN_S; then the others of the event loop have their turn.
+2. The sockets are bound by ourselves, so that a taken port is an error with a name. Before the first of them is bound,
+   the boots of this start are on disk (`engine.py`).
 """
 
 from __future__ import annotations
@@ -9,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from typing import cast
+from collections.abc import Mapping
 
 import gateway
 from gateway.clock import Clock
@@ -17,11 +19,12 @@ from gateway.core.site import Site
 from gateway.core.stats import ModbusServerStats
 from gateway.errors import ListenError
 from gateway.faces.snmp import standard
-from gateway.faces.snmp.access import Access, source_address
 from gateway.faces.snmp.counters import SnmpCounters
+from gateway.faces.snmp.engine import Engine, EngineLost, start_engine
 from gateway.faces.snmp.layout import Layout, shipped_layout
 from gateway.faces.snmp.objects import Gateway
-from gateway.faces.snmp.responder import Refused, Responder
+from gateway.faces.snmp.responder import DATAGRAM_LIMIT, Refused, Responder
+from gateway.faces.snmp.security import Security
 from gateway.faces.snmp.settings import SnmpSettings
 from gateway.faces.snmp.throttle import Throttle
 from gateway.faces.snmp.tree import Tree, whole
@@ -29,8 +32,12 @@ from gateway.faces.snmp.tree import Tree, whole
 _log = logging.getLogger(__name__)
 
 
+TURN_S = 0.001
+"""How long waiting datagrams are answered in one go; the one under way then is finished."""
+
+
 class SnmpAgent:
-    """The SNMP face: one tree, one set of communities, any number of listeners.
+    """The SNMP face: the trees of one gateway, one set of credentials, any number of listeners.
 
     `counters` tells what was asked, `layout` what there is. sysUpTime counts from the construction.
     """
@@ -38,7 +45,9 @@ class SnmpAgent:
     def __init__(self, settings: SnmpSettings, site: Site, clock: Clock, modbus: ModbusServerStats) -> None:
         self.counters = SnmpCounters()
         self.layout: Layout = shipped_layout(settings.enterprise_root)
+        self._settings = settings
         self._clock = clock
+        self._engine: Engine | None = None
         described = Gateway(
             site=site,
             version=gateway.__version__,
@@ -54,24 +63,71 @@ class SnmpAgent:
             ),
         )
         self.tree: Tree = whole(self.layout, described, standard.GROUPS, (standard.CAPABILITIES,))
-        self._responder = Responder(Access(settings.communities), self.tree, self.counters)
+        contexts: Mapping[bytes, Tree] = {b"": self.tree}
+        self._responder = Responder(settings, contexts, self.counters)
         self._throttle = Throttle()
         self.listeners = tuple(SnmpListener(self, host, port) for host, port in settings.listen)
         self._warm_up()
 
-    def answer(self, data: bytes, host: str) -> bytes | None:
-        """The reply to a datagram from `host`, or None; never raises."""
+    def engine(self) -> Engine:
+        """The SNMPv3 engine of this start; the first call writes its boots. EngineLost when there can be none."""
+        if self._engine is None:
+            settings = self._settings
+            enterprise = settings.enterprise_root[6]
+            now = self._clock.monotonic()
+            self._engine = start_engine(settings.state_dir, enterprise, now, renew=settings.renew_engine)
+        return self._engine
+
+    def prepare(self) -> None:
+        """Make SNMPv3 ready where there are users: before a socket is bound, and once."""
+        users = self._settings.users
+        if not users or self._responder.security is not None:
+            return
+        try:
+            engine = self.engine()
+        except EngineLost as error:
+            _log.error('event=snmp_v3_off reason="%s"', error)
+            return
+        self._responder.security = Security(engine, [user.credentials for user in users], self.counters)
+        _log.info("event=snmp_v3_on engine_id=%s boots=%d users=%d", engine.engine_id.hex(), engine.boots, len(users))
+
+    def answer(self, data: bytes, host: str, context: bytes = b"") -> bytes | None:
+        """What goes back for a datagram from `host`, or None; never raises. `context` is that of the listener."""
         now = self._clock.monotonic()
         try:
-            return self._responder.answer(data, source_address(host), now)
+            return self._responder.answer(data, host, now, context)
         except Refused as refused:
-            count = self._throttle.due(refused.refusal.value, now)
+            label = refused.refusal.label
+            count = self._throttle.due(label, now)
             if count:
-                _log.warning("snmp_dropped reason=%s source=%s count=%d", refused.refusal.value, host, count)
+                _log.warning("event=snmp_dropped reason=%s source=%s count=%d", label, host, count)
+            return refused.report or None
         except Exception:  # noqa: BLE001 - the datagram edge: whatever one datagram does, the next one is served
             self.counters.internal_errors += 1
-            _log.exception("snmp_internal_error source=%s", host)
+            _log.exception("event=snmp_internal_error source=%s", host)
         return None
+
+    def answer_waiting(self, sock: socket.socket, context: bytes = b"") -> None:
+        """Answer what waits in the socket, for one turn."""
+        monotonic = self._clock.monotonic
+        until = monotonic() + TURN_S
+        while True:
+            try:
+                data, address = sock.recvfrom(DATAGRAM_LIMIT + 1)
+            except (BlockingIOError, InterruptedError):
+                return
+            except OSError as error:
+                # An asker that is gone by now (ICMP port unreachable); nothing of ours is wrong.
+                _log.debug("event=snmp_receive_failed reason=%s", error)
+                continue
+            reply = self.answer(data, address[0], context)
+            if reply is not None:
+                try:
+                    sock.sendto(reply, address)
+                except OSError:
+                    self.counters.send_failures += 1
+            if monotonic() >= until:
+                return
 
     def _warm_up(self) -> None:
         """Encode every cell and answer every kind of request once, so that no first request waits for it."""
@@ -79,27 +135,6 @@ class SnmpAgent:
         for slot in self.tree:
             slot.varbind(now)
         self._responder.rehearse(now)
-
-
-class _Endpoint(asyncio.DatagramProtocol):
-    """Five moves between socket and agent."""
-
-    def __init__(self, agent: SnmpAgent, label: str) -> None:
-        self._agent = agent
-        self._label = label
-        self._transport: asyncio.DatagramTransport | None = None
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = cast("asyncio.DatagramTransport", transport)
-
-    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
-        reply = self._agent.answer(data, addr[0])
-        if reply is not None and self._transport is not None:
-            self._transport.sendto(reply, addr)
-
-    def error_received(self, exc: Exception) -> None:
-        # An asker that is gone by now (ICMP port unreachable); nothing of ours is wrong.
-        _log.debug("snmp_send_failed listener=%s reason=%s", self._label, exc)
 
 
 class SnmpListener:
@@ -111,20 +146,21 @@ class SnmpListener:
         self._port = port
         shown = f"[{host}]" if ":" in host else host
         self.label = f"snmp {shown}:{port}"
-        self._transport: asyncio.DatagramTransport | None = None
+        self._socket: socket.socket | None = None
 
     @property
     def bound(self) -> tuple[str, int] | None:
         """Address and port after `start`, None while not listening."""
-        if self._transport is None:
+        if self._socket is None:
             return None
-        name = self._transport.get_extra_info("sockname")
+        name = self._socket.getsockname()
         return name[0], name[1]
 
     async def start(self) -> None:
         """Bind and serve; raises ListenError, which names address and reason, and leaves nothing open."""
-        if self._transport is not None:
+        if self._socket is not None:
             return
+        self._agent.prepare()
         loop = asyncio.get_running_loop()
         sock: socket.socket | None = None
         try:
@@ -138,16 +174,16 @@ class SnmpListener:
                 # One socket, one family: [::] and 0.0.0.0 can both be listed.
                 sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
             sock.bind(address)
-            self._transport, _ = await loop.create_datagram_endpoint(
-                lambda: _Endpoint(self._agent, self.label), sock=sock
-            )
         except OSError as error:
             if sock is not None:
                 sock.close()
             raise ListenError(f"{self.label} (UDP): {error.strerror or error}") from error
+        self._socket = sock
+        loop.add_reader(sock, self._agent.answer_waiting, sock)
 
     async def stop(self) -> None:
         """Close the socket; a listener that is not started stays so."""
-        transport, self._transport = self._transport, None
-        if transport is not None:
-            transport.close()
+        sock, self._socket = self._socket, None
+        if sock is not None:
+            asyncio.get_running_loop().remove_reader(sock)
+            sock.close()

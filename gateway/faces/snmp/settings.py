@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from ipaddress import IPv4Network, IPv6Network
+from pathlib import Path
+
+from gateway.faces.snmp.usm import Credentials
 
 Network = IPv4Network | IPv6Network
 Oid = tuple[int, ...]
@@ -26,11 +29,43 @@ def parse_oid(text: str) -> Oid:
 
 
 @dataclass(frozen=True, slots=True)
+class View:
+    """What a credential may read: subtrees of the tree that is served, less others. An empty one shows nothing."""
+
+    include: tuple[Oid, ...] = ()
+    exclude: tuple[Oid, ...] = ()
+
+    def shows(self, oid: Oid) -> bool:
+        """Whether `oid` is in the view: the longest subtree that holds it decides (RFC 3415 §4); none means no."""
+        included = max((len(base) for base in self.include if oid[: len(base)] == base), default=0)
+        excluded = max((len(base) for base in self.exclude if oid[: len(base)] == base), default=0)
+        return included > excluded
+
+
+EVERYTHING = View(((1, 3, 6, 1, 2, 1), (1, 3, 6, 1, 4, 1)))
+"""mib-2 and enterprises. Of these the gateway serves what its tree has, and of nothing else."""
+
+
+@dataclass(frozen=True, slots=True)
 class Community:
-    """A community that may read, and from where. There is no other right that one could have."""
+    """A community that may read, from where, and what. There is no other right that one could have."""
 
     name: str = field(repr=False)  # a credential: never shown
     sources: tuple[Network, ...]
+    view: View = EVERYTHING
+
+
+@dataclass(frozen=True, slots=True)
+class User:
+    """An SNMPv3 user that may read with authentication and privacy, from where, and what."""
+
+    credentials: Credentials
+    sources: tuple[Network, ...]
+    view: View = EVERYTHING
+
+
+REPLY_LIMIT = 1400
+"""Octets of the longest reply: fits a frame over IPv6 and a tunnel, so it is never cut on the way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +74,12 @@ class SnmpSettings:
 
     listen: tuple[tuple[str, int], ...] = (("127.0.0.1", 1161),)
     communities: tuple[Community, ...] = ()  # none by default: nobody can read
+    users: tuple[User, ...] = ()
     enterprise_root: Oid = DEFAULT_ROOT
     contact: str = ""  # sysContact
     location: str = ""  # sysLocation
+    v1: bool = False  # whether communities may be used with SNMPv1 too
+    state_dir: Path | None = None  # where engine id and boots are kept; None: a new engine id at every start
+    renew_engine: bool = True  # whether a lost engine id is replaced by a new one; otherwise SNMPv3 stays off
+    requests_per_s: float = 2000.0  # of one source in the long run; ten seconds' worth may come at once
+    reply_octets: int = REPLY_LIMIT

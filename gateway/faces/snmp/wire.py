@@ -1,9 +1,8 @@
-"""What the agent writes, in BER, and the two fields that it reads before it trusts a datagram.
+"""What the agent writes, in BER.
 
-Messages are decoded by pysnmp's own message classes (`responder.py`); nothing of that is repeated here. Replies are
-put together from finished pieces instead, because a varbind that is kept as bytes costs nothing to send again and
-has an exact length, which GETBULK's byte budget needs. tests/faces/snmp/test_wire.py proves each
-encoder against pyasn1's.
+Replies are put together from finished pieces, because a varbind that is kept as bytes costs nothing to send again and
+has an exact length, which GETBULK's byte budget needs. tests/faces/snmp/test_wire.py proves each encoder against
+pyasn1's. What the agent reads is in reader.py.
 """
 
 from __future__ import annotations
@@ -32,18 +31,18 @@ NO_SUCH_INSTANCE = b"\x81\x00"
 END_OF_MIB_VIEW = b"\x82\x00"
 
 RESPONSE = 0xA2
-VERSION_2C = 1
+REPORT = 0xA8
 
 
-class NotSnmp(ValueError):
-    """The datagram does not begin like an SNMP message with a community."""
+_SHORT = [[bytes((tag, size)) for size in range(0x80)] for tag in range(0x100)]
+"""Identifier and short length, ready made."""
 
 
 def tlv(tag: int, content: bytes) -> bytes:
     """One value with its identifier and definite length."""
     size = len(content)
     if size < 0x80:
-        return bytes((tag, size)) + content
+        return _SHORT[tag][size] + content
     length = size.to_bytes((size.bit_length() + 7) // 8, "big")
     return bytes((tag, 0x80 | len(length))) + length + content
 
@@ -82,48 +81,16 @@ def varbind(name: bytes, content: bytes) -> bytes:
     return tlv(0x30, name + content)
 
 
-def response(community: bytes, request_id: int, status: int, index: int, varbinds: bytes) -> bytes:
-    """A whole SNMPv2c Response message; `varbinds` are encoded VarBinds one after the other."""
-    pdu = integer(0x02, request_id) + integer(0x02, status) + integer(0x02, index) + tlv(0x30, varbinds)
-    return tlv(0x30, integer(0x02, VERSION_2C) + tlv(0x04, community) + tlv(RESPONSE, pdu))
+def counter(oid: Oid, count: int) -> bytes:
+    """A VarBind of a Counter32."""
+    return varbind(object_identifier(oid), integer(0x41, count & 0xFFFFFFFF))
 
 
-def peek(data: bytes) -> tuple[int, bytes]:
-    """Version and community of a message, without decoding what follows them; raises NotSnmp.
-
-    Access is decided by these two before the rest is touched. The outer length must be that of the datagram.
-    """
-    if data[:1] != b"\x30":
-        raise NotSnmp("no SEQUENCE")
-    start, end = _content(data, 0, len(data))
-    if end != len(data):
-        raise NotSnmp("length is not that of the datagram")
-    if data[start : start + 1] != b"\x02":
-        raise NotSnmp("no version")
-    first, after = _content(data, start, end)
-    if not 1 <= after - first <= 4:
-        raise NotSnmp("version is no small integer")
-    version = int.from_bytes(data[first:after], "big", signed=True)
-    if version != VERSION_2C:
-        return version, b""
-    if data[after : after + 1] != b"\x04":
-        raise NotSnmp("no community")
-    first, after = _content(data, after, end)
-    return version, data[first:after]
+def response(request_id: bytes, status: int, index: int, varbinds: bytes) -> bytes:
+    """A Response PDU; `request_id` is an encoded INTEGER, `varbinds` are encoded VarBinds one after the other."""
+    if status == 0:
+        return tlv(RESPONSE, request_id + _NO_ERROR + tlv(0x30, varbinds))
+    return tlv(RESPONSE, request_id + integer(0x02, status) + integer(0x02, index) + tlv(0x30, varbinds))
 
 
-def _content(data: bytes, at: int, end: int) -> tuple[int, int]:
-    """Where the content of the value at `at` begins and ends; raises NotSnmp when it passes `end`."""
-    if at + 2 > end:
-        raise NotSnmp("truncated")
-    size = data[at + 1]
-    start = at + 2
-    if size & 0x80:
-        octets = size & 0x7F
-        if not 1 <= octets <= 4 or start + octets > end:
-            raise NotSnmp("unusable length")
-        size = int.from_bytes(data[start : start + octets], "big")
-        start += octets
-    if start + size > end:
-        raise NotSnmp("longer than what holds it")
-    return start, start + size
+_NO_ERROR = b"\x02\x01\x00\x02\x01\x00"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from ipaddress import ip_address, ip_network
+from ipaddress import ip_network
 from typing import Any
 
 import pytest
@@ -17,11 +17,11 @@ from pysnmp.proto.api import v2c
 
 from gateway.core.site import Device, Site
 from gateway.faces.snmp.agent import SnmpAgent
-from gateway.faces.snmp.responder import DATAGRAM_LIMIT, REPLY_LIMIT, Refusal, Refused
-from gateway.faces.snmp.settings import Community, Oid
+from gateway.faces.snmp.responder import DATAGRAM_LIMIT, Refusal, Refused
+from gateway.faces.snmp.settings import REPLY_LIMIT, Community, Oid
 from tests.faces.snmp.stub_site import StubClock
 
-LOCAL = ip_address("127.0.0.1")
+LOCAL = "127.0.0.1"
 SYS_DESCR = (1, 3, 6, 1, 2, 1, 1, 1, 0)
 SYS_UP_TIME = (1, 3, 6, 1, 2, 1, 1, 3, 0)
 SYS_SERVICES = (1, 3, 6, 1, 2, 1, 1, 7, 0)
