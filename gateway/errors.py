@@ -82,6 +82,12 @@ class QueueTimeout(Busy):
     label = "queue_timeout"
 
 
+class RateLimited(Busy):
+    """The client, or all clients together, ask more often than they may; the message says whose limit it is."""
+
+    label = "rate_limited"
+
+
 class EchoUnknown(Busy):
     """A write waits until it is known whether the line gives requests back: an echo looks like success."""
 
