@@ -192,6 +192,26 @@ class ListenError(GatewayError):
     label = "listen"
 
 
+class CertificateRefused(GatewayError):
+    """A client's certificate cannot be served; `reason` is the label under which it is counted."""
+
+    label = "certificate_refused"
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+class TlsFilesError(GatewayError):
+    """Certificate, key, CA or CRL files cannot be used. `problems` lists all: which file's key, and what is wrong."""
+
+    label = "tls_files"
+
+    def __init__(self, problems: tuple[tuple[str, str], ...]) -> None:
+        super().__init__("; ".join(f"{key}: {text}" for key, text in problems))
+        self.problems = problems
+
+
 class HistoryError(GatewayError):
     """The history cannot be written or read; the message names the file and why.
 
