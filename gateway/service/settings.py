@@ -56,6 +56,7 @@ def line_devices(line: LineTable) -> tuple[Device, ...]:
             map=load_map(device.model),
             decode=dict(device.decode),
             expected=Identity(product=device.product, serial_number=device.serial_number),
+            reply_timeout_s=device.reply_timeout_s,
         )
         for device in line.device
     )
@@ -64,7 +65,11 @@ def line_devices(line: LineTable) -> tuple[Device, ...]:
 def line_budgets(config: Config) -> tuple[LineBudget, ...]:
     """What each line can carry, in the order of the file."""
     return tuple(
-        line_budget(settings, [load_map(device.model) for device in line.device])
+        line_budget(
+            settings,
+            [load_map(device.model) for device in line.device],
+            timeouts_s=[device.reply_timeout_s for device in line.device if device.reply_timeout_s is not None],
+        )
         for settings, line in zip(line_settings(config), config.line, strict=True)
     )
 
