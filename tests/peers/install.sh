@@ -29,6 +29,7 @@ peers=(
   "libc6-dev /usr/include/stdio.h"
   "pkg-config pkg-config"
   "libmodbus-dev /usr/include/modbus/modbus.h"
+  "libsnmp-dev /usr/include/net-snmp/net-snmp-config.h"
 )
 policy=/usr/sbin/policy-rc.d
 export PATH="$PATH:/usr/local/sbin:/usr/sbin:/sbin"
