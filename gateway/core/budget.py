@@ -33,8 +33,11 @@ class LineBudget:
     reply_deadline_s: float  # a Modbus TCP client has its answer by then, or its connection is closed
 
 
-def line_budget(settings: LineSettings, maps: Sequence[DeviceMap]) -> LineBudget:
-    """Project the use of a line whose devices have these maps (one map a device)."""
+def line_budget(settings: LineSettings, maps: Sequence[DeviceMap], *, timeouts_s: Sequence[float] = ()) -> LineBudget:
+    """Project the use of a line whose devices have these maps (one map a device).
+
+    `timeouts_s` are the time-outs of the devices that have one of their own.
+    """
     timing = settings.timing()
     period_s = {PollClass.LIVE: settings.poll.live_s, PollClass.SETTINGS: settings.poll.settings_s}
     use = sum(
@@ -45,7 +48,7 @@ def line_budget(settings: LineSettings, maps: Sequence[DeviceMap]) -> LineBudget
     stretch = max(1.0, use)
     attempt_s = (
         timing.wire_s(REQUEST_BYTES)
-        + settings.reply_timeout_s
+        + max((settings.reply_timeout_s, *timeouts_s))
         + timing.wire_s(LONGEST_FRAME_BYTES)
         + max(settings.quarantine_s, MAX_WINDOW_S)  # late replies widen it (modbus/quarantine.py)
         + timing.gap_s
