@@ -153,10 +153,11 @@ class Dispatcher:
             if not decision.allowed:
                 raise self._refused(Refusal(decision, IllegalFunction()), peer, unit, pdu, now)
             if decision.reason is Reason.WRITE and writer is not None:
-                self._check_rate(client, serving.device, now)
                 planned = writer.plan(serving.device, requester, pdu)
                 if isinstance(planned, Refusal):
                     raise self._refused(planned, peer, unit, pdu, now)
+                if not planned.slave_control:  # which nobody's flood of the line may hold back
+                    self._check_rate(client, serving.device, now)
                 self._forwarded(client)
                 return WriteOrder(unit, serving, planned, writer)
             answer = serving.answer(pdu, now)
