@@ -94,6 +94,30 @@ class ShuttingDown(Busy):
     label = "shutting_down"
 
 
+class WriteTooSoon(Busy):
+    """The register or coil was written a moment ago."""
+
+    label = "write_too_soon"
+
+
+class WriteBudgetSpent(Busy):
+    """The register was written so often today that more would wear its memory out."""
+
+    label = "write_budget_spent"
+
+
+class LedgerUnavailable(RequestError):
+    """A write cannot be noted, so it is not made (exception 04)."""
+
+    label = "ledger_unavailable"
+
+
+class WriteDiffers(RequestError):
+    """The device confirmed a write and holds another value (exception 04)."""
+
+    label = "write_differs"
+
+
 class PathUnavailable(RequestError):
     """No way to the device (exception 0A)."""
 
@@ -160,6 +184,19 @@ class ListenError(GatewayError):
     """A face cannot listen; the message names the address and why."""
 
     label = "listen"
+
+
+class HistoryError(GatewayError):
+    """The history cannot be written or read; the message names the file and why.
+
+    `kind` is for counting: "unwritable", "full", "corrupt", "locked", "newer" or "missing".
+    """
+
+    label = "history"
+
+    def __init__(self, kind: str, message: str) -> None:
+        super().__init__(message)
+        self.kind = kind
 
 
 class ConfigError(GatewayError):

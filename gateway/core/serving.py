@@ -111,6 +111,11 @@ class Serving:
                 self._client_blocks.remove(block)
         self._client_blocks.append(Block(space, read.address, read.count, outcome[2:], ask.asked_at))
 
+    def forget(self, space: Space, address: int) -> None:
+        """A register or coil was, or may have been, written: what was read of it for clients is not known any more."""
+        kept = [b for b in self._client_blocks if b.space is not space or not b.first <= address < b.first + b.count]
+        self._client_blocks = deque(kept, maxlen=CLIENT_BLOCKS)
+
     def _youngest(self, snapshot: Snapshot, space: Space, first: int, count: int) -> Block | None:
         self._forget_other_stretches(snapshot)
         best: Block | None = None

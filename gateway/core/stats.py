@@ -61,4 +61,25 @@ class ModbusServerStats:
     exceptions: Counter[int] = field(default_factory=Counter)  # exception code → count
     malformed: Counter[str] = field(default_factory=Counter)  # reason → count
     refused: Counter[str] = field(default_factory=Counter)  # the policy's reason → count
+    writes: Counter[str] = field(default_factory=Counter)  # what became of single writes that were allowed → count
     closed: Counter[str] = field(default_factory=Counter)  # why the server ended a connection → count
+
+
+@dataclass(slots=True)
+class DeviceHistoryStats:
+    """The daily log of one device: what is stored of the controller that is there now, and the harvests since start."""
+
+    harvests: int = 0
+    failures: Counter[str] = field(default_factory=Counter)  # why a harvest ended early → count
+    days: int | None = None  # stored; None: not known yet
+    apart: int | None = None  # blocks kept apart, because their hourmeter cannot be
+    harvested_at: float | None = None  # monotonic; None: never
+
+
+@dataclass(slots=True)
+class HistoryStats:
+    """The history since start."""
+
+    devices: dict[int, DeviceHistoryStats] = field(default_factory=dict)  # by unit id
+    store_up: bool = True  # False: what was read cannot be stored
+    store_errors: Counter[str] = field(default_factory=Counter)  # kind → count

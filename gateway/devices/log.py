@@ -53,10 +53,25 @@ def split_blocks(layout: LogLayout, data: bytes, first_slot: int = 0) -> dict[in
     return {first_slot + n: data[n * size : (n + 1) * size] for n in range(len(data) // size)}
 
 
-def decode_log(layout: LogLayout, blocks: Mapping[int, bytes], live_hourmeter: int | None = None) -> DailyLog:
+def hourmeter_of(layout: LogLayout, block: bytes, order: WordOrder) -> int | None:
+    """The hours at which a block was written, or None when it never was; ValueError when it has another size."""
+    if len(block) != 2 * layout.block_words:
+        raise ValueError(f"a log block has {len(block)} bytes, not {2 * layout.block_words}")
+    meter = next(field for field in layout.fields if field.name == HOURMETER)
+    pair = Struct(f">{meter.words}H").unpack_from(block, 2 * meter.offset)
+    return None if _never_written(pair) else combine(pair, order)
+
+
+def decode_log(
+    layout: LogLayout,
+    blocks: Mapping[int, bytes],
+    live_hourmeter: int | None = None,
+    known_order: WordOrder | None = None,
+) -> DailyLog:
     """Decode log blocks by slot (each `block_words` big-endian words), all or some of the ring.
 
-    `live_hourmeter` in hours makes the word order more certain. ValueError when a block has another size.
+    `live_hourmeter` in hours makes the word order more certain; `known_order` is taken as it is. ValueError when a
+    block has another size.
     """
     words = Struct(f">{layout.block_words}H")
     raw: dict[int, tuple[int, ...]] = {}
@@ -67,7 +82,9 @@ def decode_log(layout: LogLayout, blocks: Mapping[int, bytes], live_hourmeter: i
     meter = next(field for field in layout.fields if field.name == HOURMETER)
     pairs = {slot: block[meter.offset : meter.offset + meter.words] for slot, block in raw.items()}
     written = {slot: pair for slot, pair in pairs.items() if not _never_written(pair)}
-    order, certain = detect_order(tuple(written.values()), live_hourmeter)
+    order, certain = (
+        detect_order(tuple(written.values()), live_hourmeter) if known_order is None else (known_order, True)
+    )
     days = [
         LogDay(slot, combine(pair, order), MappingProxyType(_values(layout, raw[slot], order)))
         for slot, pair in written.items()

@@ -21,7 +21,7 @@ from collections.abc import Callable
 from typing import cast
 
 from gateway.core.site import Outcome, Ticket
-from gateway.faces.modbus.dispatch import Dispatcher, Forward
+from gateway.faces.modbus.dispatch import Dispatcher, Waiting
 from gateway.faces.modbus.settings import ModbusSettings
 from gateway.faces.modbus.tcp import client_name, keep_alive
 from gateway.modbus.mbap import Adu, MbapSplitter
@@ -39,13 +39,13 @@ TURN = 256  # requests looked at before other connections have their turn
 class _Due:
     """A reply that has its place in the order and may not be there yet."""
 
-    __slots__ = ("forward", "reply", "since", "ticket", "tid")
+    __slots__ = ("reply", "since", "ticket", "tid", "waiting")
 
     def __init__(self, tid: bytes, since: float) -> None:
         self.tid = tid
         self.since = since
         self.reply: bytes | None = None
-        self.forward: Forward | None = None
+        self.waiting: Waiting | None = None
         self.ticket: Ticket | None = None
 
 
@@ -294,11 +294,8 @@ class Connection(asyncio.Protocol):
         if isinstance(answer, bytes):
             due.reply = answer
             return
-        due.forward = answer
-        device = answer.device
-        due.ticket = device.line.read(
-            device, answer.ask.pdu, lambda outcome: self._done(due, outcome), client=self.peer
-        )
+        due.waiting = answer
+        due.ticket = answer.begin(self.peer, lambda outcome: self._done(due, outcome))
 
     # The way out
 
@@ -309,9 +306,9 @@ class Connection(asyncio.Protocol):
     def _conclude(self, due: _Due, outcome: Outcome) -> None:
         if self._over:
             return
-        assert due.forward is not None
+        assert due.waiting is not None
         due.ticket = None
-        due.reply = self._dispatcher.conclude(due.forward, outcome)
+        due.reply = self._dispatcher.conclude(due.waiting, outcome)
         if due is not self._due[0]:
             return
         out: list[bytes] = []

@@ -1,24 +1,27 @@
 """From a request to its reply or to the question for the line: the table of design §6, without sockets.
 
-Order of the checks: unit id, function (policy), then `core.serving`. Every request that comes in here
-is counted once as a request, and once as a cache hit, as forwarded or as an exception; an exception
-that ends a forwarded request is counted under its code as well.
+Order of the checks: unit id, function (policy), then `core.serving`, or for a write the rest of the policy.
+Every request that comes in here is counted once as a request, and once as a cache hit, as forwarded or as an
+exception; an exception that ends a forwarded request is counted under its code as well.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from gateway.clock import Clock
-from gateway.core.policy import Audit, decide
+from gateway.core.policy import Audit, Reason, Refusal, decide
 from gateway.core.serving import Ask, FromMemory, Serving
-from gateway.core.site import Device, Outcome, Site
+from gateway.core.site import Outcome, Site, Ticket
 from gateway.core.stats import ModbusServerStats
+from gateway.core.write_rules import Requester
+from gateway.core.writing import Job
 from gateway.errors import IllegalFunction, RequestError, UnitNotRouted
 from gateway.faces.modbus.hot import HotReplies
 from gateway.faces.modbus.settings import ModbusSettings
+from gateway.faces.modbus.writer import Writer
 from gateway.modbus import mbap
 from gateway.modbus.pdu import exception_reply, is_exception
 
@@ -31,16 +34,52 @@ RESERVED = range(248, 255)
 
 @dataclass(frozen=True, slots=True)
 class Forward:
-    """A request that the line has to answer."""
+    """A read that the line has to answer."""
 
     unit: int
     serving: Serving
     ask: Ask
 
     @property
-    def device(self) -> Device:
-        """Whom to ask."""
-        return self.serving.device
+    def pdu(self) -> bytes:
+        """The request."""
+        return self.ask.pdu
+
+    def begin(self, client: str, done: Callable[[Outcome], None]) -> Ticket:
+        """Ask the line; `done` as for `LinePort.read`."""
+        device = self.serving.device
+        return device.line.read(device, self.ask.pdu, done, client=client)
+
+    def concluded(self, outcome: bytes) -> None:
+        """The line has answered."""
+        self.serving.learn(self.ask, outcome)
+
+
+@dataclass(frozen=True, slots=True)
+class WriteOrder:
+    """A write that is allowed."""
+
+    unit: int
+    serving: Serving
+    job: Job
+    writer: Writer
+
+    @property
+    def pdu(self) -> bytes:
+        """The request."""
+        return self.job.pdu
+
+    def begin(self, client: str, done: Callable[[Outcome], None]) -> Ticket:
+        """Have it done; `done` as for `LinePort.write`."""
+        del client  # the job knows who asked
+        return self.writer.submit(self.job, done, self.serving.forget)
+
+    def concluded(self, outcome: bytes) -> None:
+        """A write teaches nothing: what it wrote is read again."""
+
+
+Waiting = Forward | WriteOrder
+"""A request whose answer comes later."""
 
 
 class Routes:
@@ -63,15 +102,23 @@ class Routes:
 class Dispatcher:
     """The requests of one way in. Replies are ADUs without their transaction id."""
 
-    def __init__(self, routes: Mapping[int, Serving], clock: Clock, stats: ModbusServerStats, audit: Audit) -> None:
+    def __init__(
+        self,
+        routes: Mapping[int, Serving],
+        clock: Clock,
+        stats: ModbusServerStats,
+        audit: Audit,
+        writer: Writer | None = None,
+    ) -> None:
         self.hot = HotReplies()  # its keys hold the unit id, which means another device on another way in
         self.stats = stats
         self.now = clock.monotonic
         self._audit = audit
         self._routes = routes
+        self._writer = writer
 
-    def answer(self, unit: int, pdu: bytes, peer: str, now: float) -> bytes | Forward:
-        """The reply to a request, or whom to ask for it."""
+    def answer(self, unit: int, pdu: bytes, peer: str, now: float, role: str | None = None) -> bytes | Waiting:
+        """The reply to a request, or what its answer has to come from; `role`: that of the client's certificate."""
         self.stats.requests += 1
         request = mbap.encode(0, unit, pdu)[2:]
         entry = self.hot.find(request)
@@ -82,12 +129,17 @@ class Dispatcher:
             serving = self._routes.get(unit)
             if serving is None:
                 raise UnitNotRouted
-            decision = decide(pdu[0], serving.functions)
+            writer, requester = self._writer, Requester(peer, role)
+            rules = None if writer is None else writer.rules(serving.device)
+            decision = decide(pdu[0], serving.functions, rules, requester)
             if not decision.allowed:
-                line = self._audit.record(decision, peer, unit, pdu, now)
-                if line is not None:
-                    logger.warning("%s", line)
-                raise IllegalFunction
+                raise self._refused(Refusal(decision, IllegalFunction()), peer, unit, pdu, now)
+            if decision.reason is Reason.WRITE and writer is not None:
+                planned = writer.plan(serving.device, requester, pdu)
+                if isinstance(planned, Refusal):
+                    raise self._refused(planned, peer, unit, pdu, now)
+                self.stats.forwarded += 1
+                return WriteOrder(unit, serving, planned, writer)
             answer = serving.answer(pdu, now)
         except RequestError as error:
             return self._exception(unit, pdu, error)
@@ -99,14 +151,20 @@ class Dispatcher:
         self.stats.forwarded += 1
         return Forward(unit, serving, answer)
 
-    def conclude(self, forward: Forward, outcome: Outcome) -> bytes:
-        """The reply to a forwarded request, from what the line said."""
+    def conclude(self, waiting: Waiting, outcome: Outcome) -> bytes:
+        """The reply to a request that had to wait, from what came of it."""
         if isinstance(outcome, RequestError):
-            return self._exception(forward.unit, forward.ask.pdu, outcome)
-        forward.serving.learn(forward.ask, outcome)
+            return self._exception(waiting.unit, waiting.pdu, outcome)
+        waiting.concluded(outcome)
         if is_exception(outcome):
             self.stats.exceptions[outcome[1]] += 1
-        return mbap.encode(0, forward.unit, outcome)[2:]
+        return mbap.encode(0, waiting.unit, outcome)[2:]
+
+    def _refused(self, refusal: Refusal, peer: str, unit: int, pdu: bytes, now: float) -> RequestError:
+        line = self._audit.record(refusal.decision, peer, unit, pdu, now)
+        if line is not None:
+            logger.warning("%s", line)
+        return refusal.error
 
     def _exception(self, unit: int, pdu: bytes, error: RequestError) -> bytes:
         self.stats.exceptions[error.exception_code] += 1

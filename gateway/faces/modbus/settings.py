@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from ipaddress import IPv4Network, IPv6Network, ip_network
+from pathlib import Path
+
+from gateway.core.write_rules import WriteRule
+from gateway.core.write_wear import WearLimits
 
 Network = IPv4Network | IPv6Network
 
@@ -19,6 +23,15 @@ class LineListen:
 
 
 @dataclass(frozen=True, slots=True)
+class WriteSettings:
+    """Who may write what, how often, and in which folder it is noted."""
+
+    rules: tuple[WriteRule, ...]
+    ledger: Path
+    limits: WearLimits = field(default_factory=WearLimits)
+
+
+@dataclass(frozen=True, slots=True)
 class ModbusSettings:
     """Who may connect, how many, and for how long the server waits for what."""
 
@@ -28,6 +41,7 @@ class ModbusSettings:
     evict_idle_s: float = 10.0  # only a connection that asked nothing for so long has to make room
     allow: tuple[Network, ...] = LOOPBACK
     max_age_s: float = 5.0  # `[cache] max_age_s`: older is never served from memory
+    writes: WriteSettings | None = None  # None: every write is refused
     strict_map: bool = False  # True: exception 02 outside of the map without asking the device
     idle_timeout_s: float = 600.0  # no request for so long: the connection is closed
     frame_timeout_s: float = 5.0  # a request must be complete so long after its first byte

@@ -131,6 +131,36 @@ MODBUS: tuple[ObjectType, ...] = (
 )
 
 
+LINE_ECHO = Convention(
+    "PgwLineEchoCode",
+    Syntax.ENUMERATION,
+    ((1, "unknown"), (2, "absent"), (3, "present")),
+    "Whether a line gives back what is sent on it, as two-wire EIA-485 adapters may. unknown(1): nothing was read yet.",
+)
+_ECHO_NUMBERS = {"unknown": 1, "absent": 2, "present": 3}
+
+
+def _milliseconds(number: int, name: str, description: str, get: Callable[..., float]) -> ObjectType:
+    return ObjectType(
+        number, name, Syntax.COUNTER32, description, lambda row, _now: int(get(row) * 1000), units="milliseconds"
+    )
+
+
+def _line_time(number: int, name: str, description: str, *purposes: str) -> ObjectType:
+    return _milliseconds(
+        number,
+        name,
+        description,
+        lambda row: sum(row.line.stats.seconds_by_purpose.get(purpose, 0.0) for purpose in purposes),
+    )
+
+
+def _top_client(row: LineRow) -> tuple[str, float]:
+    clients = row.line.stats.seconds_by_client
+    client = max(clients, key=clients.__getitem__, default="")
+    return client, clients.get(client, 0.0)
+
+
 def _line_change(row: LineRow, now: float) -> int:
     return row.gateway.ticks(row.line.status(now).since)
 
@@ -209,6 +239,54 @@ LINE: tuple[ObjectType, ...] = (
     _counter(22, "pgwLineNoise", "Bytes that belonged to no frame.", lambda row: row.line.stats.wire.noise_bytes),
     _counter(23, "pgwLineLate", "Bytes that came while no reply was due.", lambda row: row.line.stats.wire.late_bytes),
     _counter(24, "pgwLineEchoes", "Requests that came back as an echo.", lambda row: row.line.stats.wire.echoes),
+    ObjectType(
+        25,
+        "pgwLineStretch",
+        Syntax.GAUGE32,
+        "How long live values take between two reads, as a share of what is asked for: 1000 while the line keeps up.",
+        lambda row, now: round(row.line.status(now).stretch * 1000),
+        units="0.1 percent",
+    ),
+    ObjectType(
+        26,
+        "pgwLineEcho",
+        Syntax.ENUMERATION,
+        "Whether the line gives the gateway's own requests back.",
+        lambda row, now: _ECHO_NUMBERS[row.line.status(now).echo],
+        convention=LINE_ECHO,
+    ),
+    _counter(
+        27, "pgwLineJoinedReads", "Client reads that shared another's request.", lambda row: row.line.stats.joined
+    ),
+    _counter(28, "pgwLineWrites", "Writes sent for a client.", lambda row: row.line.stats.writes),
+    _line_time(29, "pgwLinePollTime", "Line time spent on polls.", "poll", "identify", "serial_number", "settle"),
+    _line_time(30, "pgwLineClientTime", "Line time spent on reads for clients.", "client"),
+    _line_time(31, "pgwLineWriteTime", "Line time spent on writes, slave control left out.", "write"),
+    _line_time(32, "pgwLineSlaveControlTime", "Line time spent on slave-control writes.", "slave_control"),
+    _line_time(33, "pgwLineBackgroundTime", "Line time spent on the daily log.", "background"),
+    _counter(
+        34, "pgwLineQueueWaits", "Requests of clients that had their turn.", lambda row: row.line.stats.queue_wait.count
+    ),
+    _milliseconds(
+        35,
+        "pgwLineQueueWaitTime",
+        "Time that the requests counted by pgwLineQueueWaits waited for their turn, in all.",
+        lambda row: row.line.stats.queue_wait.sum_s,
+    ),
+    _milliseconds(
+        36,
+        "pgwLineReplyTime",
+        "Time that the requests counted by pgwLineReplies took, in all.",
+        lambda row: row.line.stats.reply_time.sum_s,
+    ),
+    ObjectType(
+        37,
+        "pgwLineTopClient",
+        Syntax.TEXT,
+        "The client that used most of the line's time since the start; empty when none did.",
+        lambda row, _now: text(_top_client(row)[0]),
+    ),
+    _milliseconds(38, "pgwLineTopClientTime", "Line time that pgwLineTopClient used.", lambda row: _top_client(row)[1]),
 )
 
 
@@ -342,5 +420,38 @@ DEVICE: tuple[ObjectType, ...] = (
         "pgwDeviceImplausible",
         "Values withheld because they were outside of what the map allows.",
         lambda row: row.device.stats.implausible,
+    ),
+    _milliseconds(20, "pgwDeviceLineTime", "Line time spent on the device.", lambda row: row.device.stats.line_s),
+    ObjectType(
+        21,
+        "pgwDeviceRefresh",
+        Syntax.GAUGE32,
+        "Time between two reads of the live values, as of late; 0 before the second read.",
+        lambda row, _now: round((row.device.stats.refresh_s or 0.0) * 1000),
+        units="milliseconds",
+    ),
+    _counter(
+        22,
+        "pgwDeviceTimeouts",
+        "Requests to the device without a reply.",
+        lambda row: row.device.stats.errors["timeout"],
+    ),
+    _counter(
+        23,
+        "pgwDeviceCrcErrors",
+        "Requests to the device that ended with a reply of a wrong CRC.",
+        lambda row: row.device.stats.errors["crc"],
+    ),
+    _counter(
+        24,
+        "pgwDeviceMismatches",
+        "Requests to the device that ended with a reply to something else.",
+        lambda row: row.device.stats.errors["mismatch"],
+    ),
+    _counter(
+        25,
+        "pgwDeviceIdentityMismatches",
+        "Times that another controller than the expected one was found in the device's place.",
+        lambda row: row.device.stats.identity_mismatches,
     ),
 )

@@ -12,9 +12,10 @@ from gateway.core.snapshot import DeviceState, Snapshot
 from gateway.core.stats import ModbusServerStats
 from gateway.devices.model import DeviceMap, EnumValue, MibColumn, Point, Value
 from gateway.errors import MapError
+from gateway.faces.snmp import tables
 from gateway.faces.snmp.counters import SnmpCounters
 from gateway.faces.snmp.layout import Layout, label, layout, object_name, shipped_layout
-from gateway.faces.snmp.objects import CellValue, DeviceRow, Gateway, ObjectType, Syntax, text
+from gateway.faces.snmp.objects import CellValue, DeviceRow, Gateway, LineRow, ObjectType, Syntax, text
 
 
 def column(described: Layout, name: str) -> ObjectType:
@@ -40,11 +41,11 @@ def cell(device_map: DeviceMap, name: str, value: Value, state: DeviceState = De
 
 def test_every_point_with_a_column_is_in_the_table_of_its_group(device_map: DeviceMap) -> None:
     described = layout([device_map])
-    tables = {table.name: table for table in described.tables}
+    by_name = {table.name: table for table in described.tables}
     for point in device_map.points:
         if point.mib is None:
             continue
-        table = tables["pgw" + point.group.value.capitalize()]
+        table = by_name["pgw" + point.group.value.capitalize()]
         shown = next(each for each in table.columns if each.number == point.mib.column)
         assert shown.name == object_name(point.name)
         assert shown.units == point.mib.units
@@ -179,3 +180,30 @@ def test_text_is_cut_at_a_character() -> None:
 
 def test_syntaxes_of_the_maps_are_known() -> None:
     assert {Syntax("Integer32"), Syntax("Unsigned32"), Syntax("Enumeration"), Syntax("Bits")} <= set(Syntax)
+
+
+@pytest.fixture
+def line_row(site: Site) -> LineRow:
+    """The first line of the site."""
+    gateway = Gateway(site, "0", 0.0, ModbusServerStats(), SnmpCounters(), "", "", (1, 3), ())
+    return LineRow(gateway, site.lines[0])
+
+
+def test_the_hog_of_a_line_is_named(line_row: LineRow) -> None:
+    stats = line_row.line.stats
+    stats.seconds_by_client.update({"192.0.2.7": 1.5, "192.0.2.8": 62.25})
+    stats.seconds_by_purpose["client"] = 63.75
+    stats.seconds_by_purpose["poll"] = 10.0
+    stats.seconds_by_purpose["settle"] = 0.5
+    stats.queue_wait.observe(0.25)
+    cells = {column.name: column.get(line_row, 0.0) for column in tables.LINE}
+    assert cells["pgwLineTopClient"] == b"192.0.2.8"
+    assert cells["pgwLineTopClientTime"] == 62250
+    assert cells["pgwLineClientTime"] == 63750
+    assert cells["pgwLinePollTime"] == 10500
+    assert (cells["pgwLineQueueWaits"], cells["pgwLineQueueWaitTime"]) == (1, 250)
+
+
+def test_a_line_that_nobody_used_has_no_hog(line_row: LineRow) -> None:
+    cells = {column.name: column.get(line_row, 0.0) for column in tables.LINE}
+    assert (cells["pgwLineTopClient"], cells["pgwLineTopClientTime"]) == (b"", 0)

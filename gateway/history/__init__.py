@@ -1,0 +1,1 @@
+"""The daily log, kept for ever: harvest, store, export."""

@@ -1,0 +1,64 @@
+"""When was a day written? The log has no dates, only the hourmeter at which each of its days ended.
+
+Rule 1: a date is an estimate with an error bound, and both are stored and shown.
+Rule 2: the hourmeter counts whole hours in the day and at the look, so an age by it is right to an hour either way.
+        To this come the gateway's clock and the drift of the controller's.
+Rule 3: the hourmeter stands still while the controller has no power. A day written between two looks lies between
+        what the first says (counting forward) and what the second says (counting back); half of the distance is
+        added to its bound. For days older than the first look nothing tells of such pauses: their bound holds for
+        a controller that always had power, else they are older than stated.
+Rule 4: two looks that are further apart by hourmeter than by the clock mean that the gateway's clock was wrong at
+        one of them: the difference is added to the bound.
+Rule 5: a clock that shows a year before this program existed was never set: no date is better than that one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+HOUR_S = 3600.0
+CLOCK_S = 60.0
+"""What the gateway's clock is believed to."""
+DRIFT = 0.001
+"""What the controller's clock is believed to, as a share of the time passed; the documents give no figure."""
+FIRST_PLAUSIBLE_WALL = 1_767_225_600.0
+"""2026-01-01 UTC."""
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """One look at a controller: its hourmeter and the gateway's clock (Unix time) at the same moment."""
+
+    hours: int
+    wall: float
+
+    @property
+    def clock_set(self) -> bool:
+        """Whether the clock can have been right."""
+        return self.wall >= FIRST_PLAUSIBLE_WALL
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """When a day was written: Unix time, and by how much it may be wrong either way."""
+
+    at: float
+    error_s: float
+
+
+def estimate(hourmeter: int, now: Look, before: Look | None = None) -> Estimate | None:
+    """When the day with this hourmeter was written, by the look of now and the last one before it; None: rule 5."""
+    if not now.clock_set:
+        return None
+    age_s = (now.hours - hourmeter) * HOUR_S
+    latest = now.wall - age_s
+    error_s = HOUR_S + CLOCK_S + DRIFT * abs(age_s)
+    if before is None or not before.clock_set or hourmeter < before.hours:
+        return Estimate(latest, error_s)
+    earliest = before.wall + (hourmeter - before.hours) * HOUR_S
+    unknown_s = latest - earliest
+    if unknown_s > error_s:  # less is the noise of the whole hours
+        return Estimate((earliest + latest) / 2, error_s + unknown_s / 2)
+    if unknown_s < -error_s:
+        return Estimate(latest, error_s - unknown_s)
+    return Estimate(latest, error_s)

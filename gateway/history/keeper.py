@@ -1,0 +1,305 @@
+"""The asyncio shell of the history: makes the reads that harvest.py wants, in idle line time, and stores the days.
+
+Rule 1: reads go out in the background lane, one at a time on a line; clients and live polls come first.
+Rule 2: only an online device is asked: its identity is proved and its hourmeter is known.
+Rule 3: what cannot be stored disturbs nobody (async_store.py); no line is asked for it meanwhile.
+Rule 4: when the gateway's clock is set, the dates that were made by the wrong one are moved along. (Time in which the
+        machine slept is no step of the clock.)
+Rule 5: a day that must have been written and was not found, or an odd block behind the newest day, is looked for in
+        the whole ring, at most once in an interval.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+from gateway.clock import Clock
+from gateway.core.log_budget import LogBudget
+from gateway.core.site import Device, Outcome, Site
+from gateway.core.stats import DeviceHistoryStats, HistoryStats
+from gateway.devices.log import HOURMETER
+from gateway.devices.model import LogLayout
+from gateway.errors import DeviceOffline, HistoryError, PathUnavailable, RequestError, ShuttingDown
+from gateway.history.async_store import AsyncStore, one_thread
+from gateway.history.dates import Look
+from gateway.history.harvest import Harvest
+from gateway.history.harvest import Outcome as Ending
+from gateway.history.identity import Place, Seen
+from gateway.history.schedule import DAY_HOURS, Schedule, Who
+from gateway.history.settings import HistorySettings
+from gateway.history.store import Kept, Plan, Store
+
+CLIENT = "history"
+CHECK_S = 10.0
+CLOCK_STEP_S = 60.0
+
+_AWAY = (DeviceOffline, PathUnavailable, ShuttingDown)
+_log = logging.getLogger(__name__)
+
+
+def _awake_s() -> float:
+    """Seconds from an arbitrary start, the machine's sleep included where the system can tell."""
+    boot = getattr(time, "CLOCK_BOOTTIME", None)
+    return time.monotonic() if boot is None else time.clock_gettime(boot)
+
+
+class _Interrupted(Exception):
+    """The device, its line or the store went away."""
+
+
+@dataclass(slots=True, eq=False)
+class _Watch:
+    """One device."""
+
+    device: Device
+    layout: LogLayout
+    schedule: Schedule
+    stats: DeviceHistoryStats
+    controller: int | None = None  # the key of the controller that is there
+    most: int | None = None  # blocks a read, as far as known
+    whole_at: float | None = None  # when the whole ring was last read
+    opened: int = 0  # which opening of the store it knows
+
+
+@dataclass(frozen=True, slots=True)
+class _Result:
+    """What a harvest came to; `whole` is False while blocks are left that could not be read."""
+
+    kept: Kept
+    seen: Seen
+    ending: Ending
+    whole: bool
+
+
+class HistoryKeeper:
+    """Harvests the daily logs of a site; `run` goes on until it is cancelled."""
+
+    name = "history"
+
+    def __init__(
+        self,
+        settings: HistorySettings,
+        site: Site,
+        clock: Clock,
+        stats: HistoryStats,
+        *,
+        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
+        executor: Callable[[], Executor] = one_thread,
+        awake_s: Callable[[], float] = _awake_s,
+    ) -> None:
+        """`awake_s` is a clock that never steps and does not stop while the machine sleeps."""
+        self._settings = settings
+        self._clock = clock
+        self._stats = stats
+        self._sleep = sleep
+        self._awake_s = awake_s
+        self._store = AsyncStore(settings.directory, clock, stats, executor)
+        self._budget = LogBudget(window_s=3600.0)
+        self._clock_offset = clock.wall() - awake_s()
+        self._lines: list[list[_Watch]] = []
+        for line in site.lines:
+            watches = [self._watch(device) for device in site.devices if device.line is line]
+            self._lines.append([watch for watch in watches if watch is not None])
+
+    def _watch(self, device: Device) -> _Watch | None:
+        if device.map.log is None:
+            return None
+        stats = self._stats.devices.setdefault(device.unit_id, DeviceHistoryStats())
+        return _Watch(device, device.map.log, Schedule(self._settings.interval_s), stats)
+
+    async def run(self) -> None:
+        """Harvest until cancelled."""
+        try:
+            async with asyncio.TaskGroup() as group:
+                for watches in self._lines:
+                    if watches:
+                        group.create_task(self._tend(watches))
+        finally:
+            await self._store.close()
+
+    async def _tend(self, watches: Sequence[_Watch]) -> None:
+        """One line: its devices in turn."""
+        while True:
+            for watch in watches:
+                if not await self._store.ready():
+                    break
+                try:
+                    await self._refresh(watch)
+                    await self._mind_the_clock()
+                except HistoryError:
+                    break  # counted and told by the store
+                seen = self._look(watch.device)
+                if seen is not None and watch.schedule.due(self._clock.monotonic(), seen.look.hours, _who(seen)):
+                    await self._harvest(watch, seen)
+            await self._sleep(CHECK_S)
+
+    async def _refresh(self, watch: _Watch) -> None:
+        """Learn what a store that was opened anew has of a device."""
+        if watch.opened == self._store.opened:
+            return
+        opened = self._store.opened
+        device = watch.device
+        days, apart, looked = await self._store.call(Store.counts, device.line.name, device.name)
+        watch.stats.days, watch.stats.apart = days, apart
+        age_s = None if looked is None else max(0.0, self._clock.wall() - looked)
+        watch.stats.harvested_at = None if age_s is None else self._clock.monotonic() - age_s
+        watch.controller = None
+        watch.schedule = Schedule(self._settings.interval_s)
+        watch.opened = opened
+
+    async def _harvest(self, watch: _Watch, seen: Seen) -> None:
+        try:
+            plan = await self._store.call(Store.plan, seen, self._taken(watch))
+            result = await self._read(watch, seen, plan)
+            if result is not None and self._misses_a_day(watch, result):
+                result = await self._read(watch, result.seen, Plan(None, None, {}))
+        except _Interrupted as reason:
+            watch.schedule.interrupted(self._clock.monotonic())
+            self._failed(watch, str(reason))
+        except HistoryError as error:
+            watch.schedule.interrupted(self._clock.monotonic())
+            self._failed(watch, f"store_{error.kind}")
+        else:
+            if result is None or not result.whole:
+                watch.schedule.failed(self._clock.monotonic())
+                self._failed(watch, "refused" if result is None else "unread_blocks")
+
+    async def _read(self, watch: _Watch, seen: Seen, plan: Plan) -> _Result | None:
+        """One harvest from the plan on; None when nothing could be read."""
+        began = self._clock.monotonic()
+        harvest = Harvest(watch.layout, seen.look.hours, plan.position, plan.staged, watch.most)
+        while (read := harvest.next_read()) is not None:
+            wait_s = harvest.ready_at - self._clock.monotonic()
+            if wait_s > 0:
+                await self._sleep(wait_s)
+            outcome = await _ask(watch.device, read.pdu(watch.device.map, watch.layout))
+            if isinstance(outcome, _AWAY):
+                raise _Interrupted(outcome.label)
+            if isinstance(outcome, RequestError):
+                harvest.failed(self._clock.monotonic())
+                continue
+            blocks = harvest.replied(read, outcome, self._clock.monotonic())
+            watch.most = harvest.most
+            if blocks:
+                await self._store.call(Store.stage, seen, blocks, first=harvest.stage_anew)
+                harvest.stage_anew = False
+        ending = harvest.outcome
+        if ending is None or ending is Ending.FAILED:
+            return None
+        await self._mind_the_clock()
+        # The hourmeter went on while the ring was read, and a day may have ended.
+        later = self._look(watch.device)
+        if later is None or _who(later) != _who(seen) or later.look.hours < seen.look.hours:
+            raise _Interrupted("another_controller" if later else "offline")
+        if ending is Ending.NEWER:
+            assert plan.controller is not None
+            kept = await self._store.call(Store.keep_newer, later, watch.layout, plan.controller, harvest.blocks)
+        else:
+            watch.whole_at = self._clock.monotonic()
+            kept = await self._store.call(
+                Store.keep_ring, later, watch.layout, harvest.blocks, self._taken(watch),
+                whole=not harvest.unread,
+            )  # fmt: skip
+        result = _Result(kept, later, ending, whole=not harvest.unread)
+        self._harvested(watch, result, began)
+        return result
+
+    def _misses_a_day(self, watch: _Watch, result: _Result) -> bool:
+        """Rule 5."""
+        position = result.kept.controller.position
+        if result.ending is not Ending.NEWER or position is None:
+            return False
+        if watch.whole_at is not None and self._clock.monotonic() - watch.whole_at < self._settings.interval_s:
+            return False
+        return result.seen.look.hours > position.hourmeter + 2 * DAY_HOURS
+
+    def _look(self, device: Device) -> Seen | None:
+        """The controller at a device now, or None when it cannot be asked (rule 2)."""
+        snapshot = device.snapshot
+        hours = snapshot.shown().get(HOURMETER)
+        if hours is None:
+            return None
+        says = snapshot.identification
+        return Seen(
+            Place(device.line.name, device.name, device.unit_id),
+            device.map.model,
+            "" if says is None else says.product,
+            "" if says is None else says.revision,
+            snapshot.serial_number or "",
+            Look(int(hours), self._clock.wall() - (snapshot.age_s(HOURMETER, self._clock.monotonic()) or 0.0)),
+        )
+
+    def _taken(self, watch: _Watch) -> frozenset[int]:
+        """The controllers that other devices have."""
+        others = (other for watches in self._lines for other in watches if other is not watch)
+        return frozenset(other.controller for other in others if other.controller is not None)
+
+    def _harvested(self, watch: _Watch, result: _Result, began: float) -> None:
+        now = self._clock.monotonic()
+        kept, controller = result.kept, result.kept.controller
+        watch.controller = controller.key
+        watch.stats.days, watch.stats.apart = kept.days, kept.apart
+        if result.whole:
+            watch.stats.harvests += 1
+            watch.stats.harvested_at = now
+            newest = None if controller.position is None else controller.position.hourmeter
+            watch.schedule.done(now, controller.look.hours, _who(result.seen), newest)
+        name = watch.device.name
+        _log.info(
+            'event=history_harvested device="%s" controller="%s" read=%s new_days=%d days=%d took_s=%.1f',
+            name, controller.identity, result.ending.value, kept.new_days, kept.days, now - began,
+        )  # fmt: skip
+        if kept.replaced is not None:
+            _log.warning(
+                'event=history_controller_replaced device="%s" before="%s" controller="%s" known=%s',
+                name, kept.replaced, controller.identity, str(not kept.is_new).lower(),
+            )  # fmt: skip
+        for block in kept.new_apart:
+            _log.warning(
+                'event=history_block_apart device="%s" controller="%s" slot=%d hourmeter=%d why=%s',
+                name, controller.identity, block.slot, block.hourmeter, block.why.value,
+            )  # fmt: skip
+
+    def _failed(self, watch: _Watch, reason: str) -> None:
+        watch.stats.failures[reason] += 1
+        left_out = self._budget.spend((watch.device.name, reason), self._clock.monotonic())
+        if left_out is not None:
+            _log.warning(
+                'event=history_harvest_failed device="%s" reason=%s next=retry left_out=%d',
+                watch.device.name, reason, left_out,
+            )  # fmt: skip
+
+    async def _mind_the_clock(self) -> None:
+        """Rule 4."""
+        offset = self._clock.wall() - self._awake_s()
+        step_s = offset - self._clock_offset
+        if abs(step_s) < CLOCK_STEP_S:
+            return
+        keys = [w.controller for watches in self._lines for w in watches if w.controller is not None]
+        moved = await self._store.call(Store.shift, keys, step_s)
+        self._clock_offset = offset
+        _log.warning("event=history_clock_set step_s=%.0f days_moved=%d", step_s, moved)
+
+
+async def _ask(device: Device, pdu: bytes) -> Outcome:
+    """One background read; its ticket is given back when nobody waits any more."""
+    answer: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
+
+    def done(outcome: Outcome) -> None:
+        if not answer.done():
+            answer.set_result(outcome)
+
+    ticket = device.line.read(device, pdu, done, client=CLIENT, background=True)
+    try:
+        return await answer
+    finally:
+        ticket.cancel()
+
+
+def _who(seen: Seen) -> Who:
+    return seen.product, seen.serial
