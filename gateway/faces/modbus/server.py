@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 from collections.abc import Sequence
 from functools import partial
 
@@ -22,15 +23,16 @@ from gateway.core.policy import Audit
 from gateway.core.site import Site
 from gateway.core.stats import ModbusServerStats
 from gateway.errors import ListenError
+from gateway.faces.modbus.accepting import Acceptor, listening_socket
 from gateway.faces.modbus.connection import Connection
 from gateway.faces.modbus.dispatch import Dispatcher, Routes
 from gateway.faces.modbus.settings import ModbusSettings
+from gateway.faces.modbus.sockets import Hub, SocketTransport
 from gateway.faces.modbus.tcp import allowed, bind_problem
 
 logger = logging.getLogger(__name__)
 
 SWEEP_S = 1.0
-BACKLOG = 128
 
 
 class Listener:
@@ -41,7 +43,7 @@ class Listener:
         self._dispatcher = dispatcher
         self._host = host
         self._port = port
-        self._listening: asyncio.Server | None = None
+        self._acceptor: Acceptor | None = None
         self._connections: set[Connection] = set()
         self._empty = asyncio.Event()
         shown = f"[{host}]" if ":" in host else host
@@ -50,28 +52,28 @@ class Listener:
     @property
     def bound(self) -> tuple[str, int] | None:
         """The address that is really listened on; None while stopped."""
-        if self._listening is None or not self._listening.sockets:
+        if self._acceptor is None:
             return None
-        host, port = self._listening.sockets[0].getsockname()[:2]
+        host, port = self._acceptor.sock.getsockname()[:2]
         return host, port
 
     async def start(self) -> None:
         """Listen; raises ListenError that names the address and why. May be tried again."""
-        if self._listening is not None:
+        if self._acceptor is not None:
             return
-        loop = asyncio.get_running_loop()
         try:
-            self._listening = await loop.create_server(self._connection, self._host, self._port, backlog=BACKLOG)
+            sock = await listening_socket(self._host, self._port)
         except OSError as error:
             raise ListenError(f"{self.label}: {bind_problem(error)}") from error
+        self._acceptor = Acceptor(self._server.hub, sock, self.label, self._accepted)
         self._server.started(self)
 
     async def stop(self) -> None:
         """Take no more connections, let the open ones finish (rule 4)."""
-        listening, self._listening = self._listening, None
-        if listening is None:
+        acceptor, self._acceptor = self._acceptor, None
+        if acceptor is None:
             return
-        listening.close()
+        acceptor.close()
         for connection in tuple(self._connections):
             connection.finish()
         try:
@@ -84,11 +86,11 @@ class Listener:
                 connection.end("stopped")
         finally:
             self._server.stopped(self)
-        await listening.wait_closed()
 
-    def _connection(self) -> Connection:
+    def _accepted(self, sock: socket.socket, peername: object) -> None:
         server = self._server
-        return Connection(self._dispatcher, server.settings, partial(server.admit, self), self.left)
+        connection = Connection(self._dispatcher, server.settings, partial(server.admit, self), self.left)
+        SocketTransport(server.hub, sock, peername, connection)
 
     def joined(self, connection: Connection) -> None:
         """A connection was let in."""
@@ -107,6 +109,7 @@ class ModbusServer:
 
     def __init__(self, settings: ModbusSettings, site: Site, clock: Clock, stats: ModbusServerStats) -> None:
         self.settings = settings
+        self.hub = Hub()
         audit = Audit(stats.refused)
         routes = Routes(settings, site)
         self.dispatcher = Dispatcher(routes.by_unit(), clock, stats, audit)

@@ -47,11 +47,15 @@ def allowed(peer: str, networks: Sequence[Network]) -> bool:
 
 
 def keep_alive(transport: BaseTransport) -> None:
-    """Have the kernel end the connection of a peer that is gone: after 60 s idle, after 20 s of unacknowledged data."""
+    """Have the kernel end the connection of a peer that is gone: after 60 s idle, after 20 s of unacknowledged data.
+
+    Replies leave at once, not when the peer has acknowledged the last one.
+    """
     sock = transport.get_extra_info("socket")
     if sock is None:
         return
     with suppress(OSError):  # a peer that is gone already; its end is reported in the ordinary way
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in (
             ("TCP_KEEPIDLE", KEEPALIVE_IDLE_S),
