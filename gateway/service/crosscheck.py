@@ -38,6 +38,7 @@ def cross_problems(raw: Raw) -> list[Problem]:
     problems += _line_listeners(raw, [line.get("name") for _, line in lines])
     problems += _listen_clashes(raw, ("modbus", "http"))
     problems += _listen_clashes(raw, ("snmp",))
+    problems += _pair(raw, "http", "tls_certificate", "tls_private_key")
     if _table(raw, "modbus").get("writes") is True:
         problems.append(Problem(("modbus", "writes"), f"writing to controllers is {NOT_SUPPORTED}; allowed: false"))
     return problems
@@ -148,6 +149,13 @@ def _listen_clashes(raw: Raw, faces: tuple[str, ...]) -> Iterator[Problem]:
             seen.append((address, path))
         else:
             yield Problem(path, f"{show(text)} clashes with {render_path(other)}; allowed: another address or port")
+
+
+def _pair(raw: Raw, table: str, one: str, other: str) -> Iterator[Problem]:
+    """Two keys of which neither is of use alone."""
+    for key, missing in ((one, other), (other, one)):
+        if _table(raw, table).get(key, "") != "" and _table(raw, table).get(missing, "") == "":
+            yield Problem((table, missing), f"is missing, and {table}.{key} is there; allowed: both or neither")
 
 
 def _address(text: object) -> Address | None:

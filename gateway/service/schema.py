@@ -112,12 +112,14 @@ Listen = Annotated[str, AfterValidator(_listen)]
 Network = Annotated[str, AfterValidator(_network)]
 Seconds = Annotated[float, Field(allow_inf_nan=False)]
 Listens = Annotated[tuple[Listen, ...], Field(strict=False)]
+AbsolutePath = Annotated[str, Field(pattern=r"^(/[^\x00-\x1f]*)?$")]
 Networks = Annotated[tuple[Network, ...], Field(strict=False)]
 
 _NAME = "1 to 64 printable characters, no blank at either end"
 _TEXT = "up to 255 printable ASCII characters"
 _LISTEN = 'a list of "IPv4:port" or "[IPv6]:port" such as "127.0.0.1:1502"; [] turns the face off'
 _NETWORK = 'a list of addresses or networks such as "127.0.0.0/8", "10.1.2.3" or "::1/128"'
+_FILE = 'the absolute path of a file, or "" for none'
 _LOOPBACK = ("127.0.0.0/8", "::1/128")
 _LINE = LineSettings(name="", index=1, port="")
 _POLL = PollSettings()
@@ -303,9 +305,24 @@ class SnmpTable(Table):
 
 
 class HttpTable(Table):
-    """`[http]`: /metrics, /healthz and /readyz."""
+    """`[http]`: /metrics, /sd, /healthz and /readyz."""
 
     listen: Annotated[Listens, Key(_LISTEN, "Where Prometheus scrapes and health checks ask.")] = ("127.0.0.1:9850",)
+    basic_auth_file: Annotated[
+        AbsolutePath,
+        Key(_FILE, "Names and passwords of who may ask, one name:password a line; /healthz stays open."),
+    ] = ""
+    bearer_token_file: Annotated[
+        AbsolutePath,
+        Key(_FILE, "A token of 16 printable ASCII characters or more; who shows it may ask."),
+    ] = ""
+    tls_certificate: Annotated[
+        AbsolutePath,
+        Key(_FILE, "The certificate (PEM, with its chain) of HTTPS; needs tls_private_key."),
+    ] = ""
+    tls_private_key: Annotated[AbsolutePath, Key(_FILE, "The certificate's private key (PEM, without a password).")] = (
+        ""
+    )
 
 
 class Config(Table):

@@ -212,6 +212,14 @@ listen = ["127.0.0.1:70000"]
         (MINIMAL + "[modbus]\nmax_connections = 1.5\n", "modbus.max_connections: 1.5 is not a whole number"),
         (MINIMAL + "[modbus]\nwrites = 0\n", "modbus.writes: 0 is not true or false; allowed: false"),
         (
+            MINIMAL + '[http]\ntls_certificate = "/etc/crt"\n',
+            "http.tls_private_key: is missing, and http.tls_certificate is there; allowed: both or neither",
+        ),
+        (
+            MINIMAL + '[http]\nbearer_token_file = "token"\n',
+            'http.bearer_token_file: "token" is not allowed; allowed: the absolute path of a file, or "" for none',
+        ),
+        (
             MINIMAL + "[modbus]\nwrites = true\n",
             "modbus.writes: writing to controllers is not supported in this version",
         ),

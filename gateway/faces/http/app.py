@@ -1,4 +1,4 @@
-"""The HTTP face: `/metrics`, `/healthz`, `/readyz` and an index page, all from memory.
+"""The HTTP face: `/metrics`, `/sd`, `/healthz`, `/readyz` and an index page, all from memory.
 
 Nothing here reads a line or waits for one, whatever is asked. `/healthz` answers as long as the loop runs;
 `/readyz` says whether the configuration is served as it stands, and is not about the controllers: one that
@@ -15,6 +15,8 @@ from aiohttp import hdrs, web
 from gateway.clock import Clock
 from gateway.core.site import Site
 from gateway.core.stats import ModbusServerStats
+from gateway.faces.http.access import Access, guard
+from gateway.faces.http.discovery import targets
 from gateway.faces.http.exposition import Exposition, compressed
 from gateway.faces.http.listener import HttpListener
 from gateway.faces.http.own import Counts, HttpStats
@@ -58,9 +60,11 @@ class HttpFace:
         )
 
     def _application(self) -> web.Application:
-        application = web.Application(client_max_size=0)
+        guarded = guard(Access.read(self._settings), self._count_refused)
+        application = web.Application(client_max_size=0, middlewares=[guarded])
         application.router.add_get("/", self._index)
         application.router.add_get("/metrics", self._metrics)
+        application.router.add_get("/sd", self._discovery)
         application.router.add_get("/healthz", self._healthz)
         application.router.add_get("/readyz", self._readyz)
         return application
@@ -90,6 +94,15 @@ class HttpFace:
         self.stats.scrapes += 1
         self.stats.scrape_s += self._clock.monotonic() - began
         return reply
+
+    async def _discovery(self, request: web.Request) -> web.Response:
+        assert request.transport is not None
+        host, port, *_ = request.transport.get_extra_info("sockname")
+        found = targets(self._site.name, request.host, (host, port), secure=request.secure)
+        return web.json_response(found, headers=_NO_STORE)
+
+    def _count_refused(self) -> None:
+        self.stats.refused += 1
 
     async def _healthz(self, _request: web.Request) -> web.Response:
         return web.Response(text="ok\n", headers=_NO_STORE)
