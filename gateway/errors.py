@@ -82,6 +82,12 @@ class QueueTimeout(Busy):
     label = "queue_timeout"
 
 
+class RateLimited(Busy):
+    """The client, or all clients together, ask more often than they may; the message says whose limit it is."""
+
+    label = "rate_limited"
+
+
 class EchoUnknown(Busy):
     """A write waits until it is known whether the line gives requests back: an echo looks like success."""
 
@@ -184,6 +190,26 @@ class ListenError(GatewayError):
     """A face cannot listen; the message names the address and why."""
 
     label = "listen"
+
+
+class CertificateRefused(GatewayError):
+    """A client's certificate cannot be served; `reason` is the label under which it is counted."""
+
+    label = "certificate_refused"
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
+class TlsFilesError(GatewayError):
+    """Certificate, key, CA or CRL files cannot be used. `problems` lists all: which file's key, and what is wrong."""
+
+    label = "tls_files"
+
+    def __init__(self, problems: tuple[tuple[str, str], ...]) -> None:
+        super().__init__("; ".join(f"{key}: {text}" for key, text in problems))
+        self.problems = problems
 
 
 class HistoryError(GatewayError):

@@ -61,6 +61,7 @@ class ModbusServerStats:
     exceptions: Counter[int] = field(default_factory=Counter)  # exception code → count
     malformed: Counter[str] = field(default_factory=Counter)  # reason → count
     refused: Counter[str] = field(default_factory=Counter)  # the policy's reason → count
+    limited: Counter[str] = field(default_factory=Counter)  # whose rate limit was met → requests
     writes: Counter[str] = field(default_factory=Counter)  # what became of single writes that were allowed → count
     closed: Counter[str] = field(default_factory=Counter)  # why the server ended a connection → count
 

@@ -104,7 +104,7 @@ def open_database(directory: Path) -> sqlite3.Connection:
     """The history of this directory, for writing; made when it is not there. HistoryError when that cannot be."""
     path = directory / FILE_NAME
     with explained(directory):
-        directory.mkdir(mode=0o750, exist_ok=True)
+        directory.mkdir(mode=0o750, parents=True, exist_ok=True)
     try:
         return _open(path)
     except HistoryError as error:

@@ -117,8 +117,7 @@ class HistoryKeeper:
         try:
             async with asyncio.TaskGroup() as group:
                 for watches in self._lines:
-                    if watches:
-                        group.create_task(self._tend(watches))
+                    group.create_task(self._tend(watches))
         finally:
             await self._store.close()
 

@@ -1,20 +1,23 @@
 """The asyncio shell that owns one serial port.
 
-It makes no decision: it opens the port, moves bytes and time between the port and the `LineEngine`, and
-opens the port again after a failure. A device path is read through the event loop, and only when bytes
-are due, so that a reply of 170 bytes costs a few wake-ups and not 170; a port without a file descriptor
-(`rfc2217://`) is read by a thread.
+It makes no decision: it opens the port, moves bytes and time between the port (transports.py) and the
+`LineEngine`, and opens the port again after a failure.
+
+Rule 1: nothing here blocks the loop; ports are opened and closed in threads.
+Rule 2: a port that failed is opened again after 0.1 s, then after twice as long each time up to 4.5 s, so that one
+        that is plugged in again is in use within 5 s. Bytes of the first 0.2 s are dropped: adapters spit.
+Rule 3: one log line when the line goes down, or cannot be opened for another reason than before, and one when it is
+        up. A port that is lost again and again within seconds is no news until it stays.
+Rule 4: a request goes out when the gap is over and not a timer's rounding later: the last millisecond is spent in
+        turns of the loop, which go on serving everybody else.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import io
 import logging
-import os
-import threading
 from collections.abc import Callable, Sequence
+from functools import partial
 from random import Random
 
 import serial
@@ -26,14 +29,19 @@ from gateway.core.settings import LineSettings
 from gateway.core.site import Device, LineStatus, Outcome, Ticket
 from gateway.core.stats import LineStats
 from gateway.errors import PortError
-from gateway.lines.ports import open_port
+from gateway.lines.ports import close_port, open_port
+from gateway.lines.threads import in_thread
+from gateway.lines.transports import Transport, transport_for
 
 log = logging.getLogger(__name__)
 
 FIRST_RETRY_S = 0.1
-LAST_RETRY_S = 5.0
-SETTLE_S = 0.2  # a USB adapter that was just plugged in may still spit bytes
-READ_BYTES = 512
+LAST_RETRY_S = 4.5
+STABLE_S = 5.0  # a port that stayed so long works
+SETTLE_S = 0.2
+CLOSE_S = 1.0  # longer than that nobody waits for a port to close
+PRECISE_S = 0.0005  # timers are late or early by up to that
+SAID = 16  # reasons that are remembered
 
 
 class SerialLine:
@@ -48,10 +56,15 @@ class SerialLine:
         self._engine = LineEngine(settings, devices, clock.monotonic(), self._rng)
         self._char_s = settings.timing().char_s
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._timer: asyncio.TimerHandle | None = None
+        self._timer: asyncio.Handle | None = None
+        self._deadline = 0.0  # what the timer is for
+        self._reply_by = 0.0  # the end of the wait for the reply under way, or sooner
         self._wake: asyncio.Handle | None = None
-        self._port: _FilePort | _ThreadPort | None = None
+        self._port: Transport | None = None
         self._failed: asyncio.Future[str] | None = None
+        self._down_at: float | None = None
+        self._said: set[str] = set()  # why it is down, as logged since it was up
+        self._flapping = False  # it was lost within seconds the last time
         for device in devices:
             device.line = self
 
@@ -102,48 +115,66 @@ class SerialLine:
         """Own the port until cancelled: open it, serve it, and open it again when it fails."""
         self._loop = asyncio.get_running_loop()
         retry_s = FIRST_RETRY_S
-        said = ""
         try:
             while True:
                 try:
-                    port = await asyncio.to_thread(open_port, self.settings)
+                    port = await in_thread(partial(open_port, self.settings), late=close_port, name=f"open-{self.name}")
                 except PortError as error:
                     self._close(str(error))
-                    if str(error) != said:  # once, not at every try
-                        log.error('event=line_down line=%s reason="%s"', self.name, error)  # noqa: TRY400  # expected
-                        said = str(error)
+                    self._complain(str(error))
                 else:
-                    opened_at = self._clock.monotonic()
-                    said = await self._serve(port)
-                    log.error('event=line_down line=%s reason="%s"', self.name, said)
-                    if self._clock.monotonic() - opened_at > LAST_RETRY_S:
+                    if await self._serve(port) >= STABLE_S:
                         retry_s = FIRST_RETRY_S
-                await asyncio.sleep(retry_s * (1 + 0.1 * self._rng.random()))
+                await asyncio.sleep(retry_s * (1 - 0.1 * self._rng.random()))
                 retry_s = min(2 * retry_s, LAST_RETRY_S)
         finally:
             self._close("stopped")
 
-    async def _serve(self, port: serial.Serial) -> str:
-        """Move bytes until the port fails; gives the reason."""
+    async def _serve(self, port: serial.Serial) -> float:
+        """Move bytes until the port fails; gives how many seconds it was in use."""
         loop = asyncio.get_running_loop()
         self._failed = loop.create_future()
-        fd = _file_descriptor(port)
-        shell = _ThreadPort(port, loop, self) if fd is None else _FilePort(port, fd, loop, self)
+        transport = transport_for(port, loop, self, char_s=self._char_s, name=self.name)
+        announcing: asyncio.TimerHandle | None = None
+        up_s = 0.0
+        reason = "stopped"
         try:
-            await asyncio.sleep(SETTLE_S)
-            shell.start()
-            self._port = shell
-            log.info('event=line_up line=%s port="%s"', self.name, self.port)
-            self._engine.opened(self._clock.monotonic())
-            self._advance()
-            return await self._failed
+            transport.start()
+            await asyncio.wait({self._failed}, timeout=SETTLE_S)
+            if not self._failed.done():
+                up_at = self._clock.monotonic()
+                announcing = loop.call_later(STABLE_S if self._flapping else 0.0, self._announce)
+                self._port = transport
+                self._engine.opened(up_at)
+                self._advance()
+                await asyncio.wait({self._failed})
+                up_s = self._clock.monotonic() - up_at
+            reason = self._failed.result()
         finally:
             self._port = None
-            shell.stop()
-            with contextlib.suppress(OSError, serial.SerialException):
-                port.close()
-            failed = self._failed.done() and not self._failed.cancelled() and self._failed.exception() is None
-            self._close(self._failed.result() if failed else "stopped")
+            transport.stop()
+            if announcing is not None:
+                announcing.cancel()
+            self._close(reason)
+            closing = in_thread(partial(close_port, port), late=lambda _none: None, name=f"close-{self.name}")
+            await asyncio.wait({closing}, timeout=CLOSE_S)
+        self._flapping = up_s < STABLE_S
+        self._complain(reason)
+        return up_s
+
+    def _complain(self, reason: str) -> None:
+        if self._down_at is None:
+            self._down_at = self._clock.monotonic()
+        if reason not in self._said:
+            if len(self._said) < SAID:
+                self._said.add(reason)
+            log.error('event=line_down line=%s reason="%s"', self.name, reason)
+
+    def _announce(self) -> None:
+        lasted = "" if self._down_at is None else f" down_s={self._clock.monotonic() - self._down_at:.1f}"
+        log.info('event=line_up line=%s port="%s"%s', self.name, self.port, lasted)
+        self._down_at = None
+        self._said.clear()
 
     def _close(self, reason: str) -> None:
         if self._timer is not None:
@@ -157,17 +188,18 @@ class SerialLine:
         self._advance()
 
     def on_bytes(self, data: bytes) -> None:
-        """The port gave bytes."""
-        self._advance(data)
+        """See `Owner.on_bytes`; before the line is open they are dropped."""
+        if self._port is not None:
+            self._advance(data)
 
     def on_failure(self, reason: str) -> None:
-        """The port failed; `run` takes over."""
+        """See `Owner.on_failure`; `run` takes over."""
         if self._failed is not None and not self._failed.done():
-            self._failed.set_result(reason)
+            self._failed.set_result(f"{self.port}: {reason}")
 
-    def wait_for_bytes_s(self) -> float:
-        """Seconds until the rest of the awaited reply can have arrived."""
-        return max(0, self._engine.bytes_due() - 1) * self._char_s
+    def bytes_due(self) -> int:
+        """See `Owner.bytes_due`."""
+        return self._engine.bytes_due()
 
     def _advance(self, data: bytes = b"") -> None:
         """Let the engine act; its mistake ends `run`, which the service starts again, instead of hanging the line."""
@@ -187,132 +219,34 @@ class SerialLine:
         if data:
             self._engine.receive(data, now)
         self._engine.on_timer(now)
-        frame = self._engine.step(self._clock.monotonic())
+        frame = self._engine.step(now)
         if frame is not None and self._port is not None:
             self._port.write(frame)
-        deadline = self._engine.next_deadline(self._clock.monotonic())
+        deadline = self._engine.next_deadline(now)
+        if frame is not None:
+            self._reply_by = now if deadline is None else deadline
         if deadline is not None and self._loop is not None:
-            delay_s = max(0.0, deadline - self._clock.monotonic())
-            self._timer = self._loop.call_later(delay_s, self._on_timer)
+            self._set_alarm(deadline, self._loop)
+
+    def _set_alarm(self, deadline: float, loop: asyncio.AbstractEventLoop) -> None:
+        now = self._clock.monotonic()
+        due = self._engine.bytes_due()
+        if due:  # nothing is to be done while a reply is still coming in, unless the wait for it is over
+            deadline = max(deadline, min(self._reply_by, now + due * self._char_s))
+        self._deadline = deadline
+        delay_s = deadline - now
+        if due:  # and a time-out need not be precise
+            self._timer = loop.call_later(max(0.0, delay_s), self._on_timer)
+        elif delay_s > PRECISE_S:
+            self._timer = loop.call_later(delay_s - PRECISE_S, self._on_timer)
+        else:
+            self._timer = loop.call_soon(self._on_timer)
 
     def _on_timer(self) -> None:
+        now = self._clock.monotonic()
+        if now < self._deadline and self._loop is not None:
+            self._set_alarm(self._deadline, self._loop)
+            return
         self._timer = None
-        self._advance()
-
-
-class _FilePort:
-    """A port with a file descriptor, on the event loop."""
-
-    def __init__(self, port: serial.Serial, fd: int, loop: asyncio.AbstractEventLoop, line: SerialLine) -> None:
-        self._port = port
-        self._fd = fd
-        self._loop = loop
-        self._line = line
-        self._rest = b""
-        self._pause: asyncio.TimerHandle | None = None
-        self._stopped = False
-
-    def start(self) -> None:
-        """Drop what came before and listen."""
-        os.set_blocking(self._fd, False)
-        with contextlib.suppress(OSError, serial.SerialException, AttributeError):
-            self._port.reset_input_buffer()
-        self._loop.add_reader(self._fd, self._readable)
-
-    def stop(self) -> None:
-        """Stop listening; the port may be closed after it."""
-        self._stopped = True
-        if self._pause is not None:
-            self._pause.cancel()
-        self._loop.remove_reader(self._fd)
-        self._loop.remove_writer(self._fd)
-
-    def write(self, frame: bytes) -> None:
-        """Write a frame; what the kernel does not take now follows as soon as it does."""
-        self._rest += frame
-        self._writable()
-
-    def _writable(self) -> None:
-        try:
-            written = os.write(self._fd, self._rest)
-        except BlockingIOError:
-            written = 0
-        except OSError as error:
-            self._line.on_failure(f"{self._line.port}: {error.strerror}")
-            return
-        self._rest = self._rest[written:]
-        if self._rest:
-            self._loop.add_writer(self._fd, self._writable)
-        else:
-            self._loop.remove_writer(self._fd)
-
-    def _readable(self) -> None:
-        try:
-            data = os.read(self._fd, READ_BYTES)
-        except BlockingIOError:
-            return
-        except OSError as error:
-            self._fail(error.strerror or str(error))
-            return
-        if not data:
-            self._fail("end of file (unplugged?)")
-            return
-        self._line.on_bytes(data)
-        wait_s = self._line.wait_for_bytes_s()
-        if wait_s > 0 and not self._stopped:
-            self._loop.remove_reader(self._fd)
-            self._pause = self._loop.call_later(wait_s, self._resume)
-
-    def _resume(self) -> None:
-        self._pause = None
-        self._loop.add_reader(self._fd, self._readable)
-
-    def _fail(self, reason: str) -> None:
-        self._loop.remove_reader(self._fd)  # a dead descriptor is readable for ever
-        self._line.on_failure(f"{self._line.port}: {reason}")
-
-
-class _ThreadPort:
-    """A port without a file descriptor (`rfc2217://`): one thread reads, the loop writes."""
-
-    def __init__(self, port: serial.Serial, loop: asyncio.AbstractEventLoop, line: SerialLine) -> None:
-        self._port = port
-        self._loop = loop
-        self._line = line
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._read, name=f"line-{line.name}", daemon=True)
-
-    def start(self) -> None:
-        """Drop what came before and listen."""
-        self._port.reset_input_buffer()
-        self._port.timeout = 0.1
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop listening; the thread ends by itself within its read time-out."""
-        self._stopped.set()
-
-    def write(self, frame: bytes) -> None:
-        """Write a frame: eight bytes into a socket's buffer."""
-        try:
-            self._port.write(frame)
-        except (OSError, serial.SerialException) as error:
-            self._line.on_failure(f"{self._line.port}: {error}")
-
-    def _read(self) -> None:
-        try:
-            while not self._stopped.is_set():
-                data = self._port.read(max(1, self._port.in_waiting))
-                if data and not self._stopped.is_set():
-                    self._loop.call_soon_threadsafe(self._line.on_bytes, bytes(data))
-        except (OSError, serial.SerialException, TypeError, AttributeError) as error:
-            # pyserial raises TypeError or AttributeError when the port is closed under a read
-            if not self._stopped.is_set():
-                self._loop.call_soon_threadsafe(self._line.on_failure, f"{self._line.port}: {error}")
-
-
-def _file_descriptor(port: serial.Serial) -> int | None:
-    try:
-        return int(port.fileno())
-    except (io.UnsupportedOperation, AttributeError, OSError):
-        return None
+        # A reply that is there counts, although the reader sleeps: what looked like its head may have been noise.
+        self._advance(self._port.take() if self._port is not None and now >= self._reply_by else b"")

@@ -1,4 +1,4 @@
-"""The gateway put together: lines, devices, three faces, one supervisor; and its life from start to signal.
+"""The gateway put together: lines, devices, faces, history, one supervisor; and its life from start to signal.
 
 Rule 1: nothing is opened while it is built; a mistake here is a bad configuration or a bug, never a busy port.
 Rule 2: the first SIGTERM or SIGINT stops in order (service/supervisor.py), the second ends the process at once.
@@ -17,14 +17,17 @@ from dataclasses import asdict
 from gateway import __version__
 from gateway.clock import Clock, SystemClock
 from gateway.core.site import Site
-from gateway.core.stats import ModbusServerStats
+from gateway.core.stats import HistoryStats, ModbusServerStats
 from gateway.faces.http.app import HttpFace
 from gateway.faces.modbus.server import ModbusServer
 from gateway.faces.snmp.agent import SnmpAgent
+from gateway.history.keeper import HistoryKeeper
+from gateway.history.source import HistorySource
 from gateway.lines.serial import SerialLine
 from gateway.service.advice import advice
 from gateway.service.config import Config
 from gateway.service.settings import (
+    history_settings,
     http_settings,
     line_budgets,
     line_devices,
@@ -50,6 +53,8 @@ class Gateway:
         stats = ModbusServerStats()
         modbus = ModbusServer(modbus_settings(config), self.site, clock, stats)
         snmp = SnmpAgent(snmp_settings(config), self.site, clock, stats)
+        history = HistoryStats() if config.history.enabled else None
+        kept = history_settings(config)
         http = HttpFace(
             http_settings(config),
             self.site,
@@ -57,9 +62,12 @@ class Gateway:
             modbus=stats,
             snmp=lambda: asdict(snmp.counters),
             not_ready=self.not_ready,
+            history=history,
+            log=None if history is None else HistorySource(kept.directory, config.site),
         )
+        self.keepers = () if history is None else (HistoryKeeper(kept, self.site, clock, history),)
         self.listeners: tuple[Listener, ...] = (*modbus.listeners, *snmp.listeners, *http.listeners)
-        self.supervisor = Supervisor(clock, self.lines, self.listeners)
+        self.supervisor = Supervisor(clock, self.lines, self.listeners, self.keepers)
 
     def not_ready(self) -> tuple[str, ...]:
         """Why the gateway does not do what its configuration says: the listeners that are not open."""

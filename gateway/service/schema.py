@@ -111,6 +111,7 @@ Text = Annotated[str, Field(pattern=r"^[ -~]{0,255}$")]
 Listen = Annotated[str, AfterValidator(_listen)]
 Network = Annotated[str, AfterValidator(_network)]
 Seconds = Annotated[float, Field(allow_inf_nan=False)]
+Hours = Annotated[float, Field(allow_inf_nan=False)]
 Listens = Annotated[tuple[Listen, ...], Field(strict=False)]
 AbsolutePath = Annotated[str, Field(pattern=r"^(/[^\x00-\x1f]*)?$")]
 Networks = Annotated[tuple[Network, ...], Field(strict=False)]
@@ -325,6 +326,22 @@ class HttpTable(Table):
     )
 
 
+class HistoryTable(Table):
+    """`[history]`: the controllers' daily log, kept for ever in state_dir."""
+
+    enabled: Annotated[
+        bool,
+        Key("true or false", "Read the controllers' daily logs in idle line time and keep every day in state_dir."),
+    ] = True
+    interval_h: Annotated[
+        Hours,
+        Key(
+            "1.0 to 720.0",
+            "By when a log is read again at the latest; it is read anyway soon after a day must have ended.",
+        ),
+    ] = Field(default=24.0, ge=1.0, le=720.0)
+
+
 class Config(Table):
     """The whole file."""
 
@@ -342,3 +359,4 @@ class Config(Table):
     modbus: Annotated[ModbusTable, Key("a [modbus] table", "The Modbus TCP face.")] = ModbusTable()
     snmp: Annotated[SnmpTable, Key("an [snmp] table", "The SNMP face.")] = SnmpTable()
     http: Annotated[HttpTable, Key("an [http] table", "The HTTP face.")] = HttpTable()
+    history: Annotated[HistoryTable, Key("a [history] table", "The controllers' daily log.")] = HistoryTable()

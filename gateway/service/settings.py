@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+from pathlib import Path
 
 from gateway.core.budget import LineBudget, line_budget
 from gateway.core.identity import Identity
@@ -12,6 +13,7 @@ from gateway.devices.schema import load_map
 from gateway.faces.http.settings import HttpSettings
 from gateway.faces.modbus.settings import LineListen, ModbusSettings
 from gateway.faces.snmp.settings import Community, SnmpSettings
+from gateway.history.settings import HistorySettings
 from gateway.service.schema import Config, LineTable, parse_listen, parse_root
 
 Pairs = tuple[tuple[str, int], ...]
@@ -107,6 +109,11 @@ def http_settings(config: Config) -> HttpSettings:
         tls_certificate=http.tls_certificate,
         tls_private_key=http.tls_private_key,
     )
+
+
+def history_settings(config: Config) -> HistorySettings:
+    """The settings of the history; whether there is one is `config.history.enabled`."""
+    return HistorySettings(Path(config.state_dir), interval_s=config.history.interval_h * 3600)
 
 
 def _pairs(listens: tuple[str, ...]) -> Pairs:

@@ -33,11 +33,11 @@ _log = logging.getLogger(__name__)
 
 
 class Runnable(Protocol):
-    """A line: runs until it is cancelled, and opens and reopens its port by itself."""
+    """A line or the history: runs until it is cancelled, and opens and reopens what it needs by itself."""
 
     @property
     def name(self) -> str:
-        """The configured name."""
+        """What the log calls its task; of a line the configured name."""
         ...
 
     async def run(self) -> None:
@@ -75,11 +75,13 @@ class Supervisor:
         clock: Clock,
         lines: Sequence[Runnable],
         listeners: Sequence[Listener],
+        keepers: Sequence[Runnable] = (),
         *,
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> None:
         self._clock = clock
         self._lines = tuple(lines)
+        self._keepers = tuple(keepers)
         self._listeners = tuple(listeners)
         self._sleep = sleep
         self._up: set[int] = set()
@@ -92,7 +94,9 @@ class Supervisor:
 
     async def run(self, stop: asyncio.Event) -> None:
         """Keep everything going until `stop` is set, then stop it in order; returns in at most about 2.5 s more."""
-        lines = [asyncio.create_task(self._keep_line(line), name=f"line {line.name}") for line in self._lines]
+        named = [(f"line {line.name}", line) for line in self._lines]
+        named += [(keeper.name, keeper) for keeper in self._keepers]
+        lines = [asyncio.create_task(self._keep_running(name, runnable), name=name) for name, runnable in named]
         listeners = [
             asyncio.create_task(self._keep_listener(i, listener), name=listener.label)
             for i, listener in enumerate(self._listeners)
@@ -118,17 +122,16 @@ class Supervisor:
         for task in late:
             _log.warning('event=stop_late task="%s" waited_s=%.1f', task.get_name(), timeout_s)
 
-    async def _keep_line(self, line: Runnable) -> None:
-        name = f"line {line.name}"
+    async def _keep_running(self, name: str, runnable: Runnable) -> None:
         delays = _delays()
         while True:
             began = self._clock.monotonic()
             try:
-                await line.run()
+                await runnable.run()
             except Exception as error:  # noqa: BLE001 - the task supervisor's edge: counted and logged there
                 self._bug(name, error)
             else:
-                self._bug(name, RuntimeError("the line's task returned"))
+                self._bug(name, RuntimeError("the task returned"))
             if self._clock.monotonic() - began > STEADY_S:
                 delays = _delays()
             await self._sleep(next(delays))

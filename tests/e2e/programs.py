@@ -145,17 +145,19 @@ def write_config(
     devices: Sequence[tuple[str, str, int, int]] = DEMO_DEVICES,
     line_keys: str = "",
     rest: str = "",
+    *,
+    modbus_keys: str = "",
 ) -> None:
     """A configuration whose lines are links in the folder of the file."""
     modbus, snmp, http = ports
-    text = 'site = "ridge-07"\n'
+    text = f'site = "ridge-07"\nstate_dir = "{path.parent / "state"}"\n'
     for line in dict.fromkeys(device[0] for device in devices):
         text += f'[[line]]\nname = "{line}"\nport = "{path.parent / line}"\n{line_keys}\n'
         for at, name, address, unit in devices:
             if at == line:
                 text += f'[[line.device]]\nname = "{name}"\naddress = {address}\nunit_id = {unit}\n'
                 text += 'model = "prostar-mppt"\n'
-    text += f'[modbus]\nlisten = ["127.0.0.1:{modbus}"]\n[http]\nlisten = ["127.0.0.1:{http}"]\n'
+    text += f'[modbus]\nlisten = ["127.0.0.1:{modbus}"]\n{modbus_keys}\n[http]\nlisten = ["127.0.0.1:{http}"]\n'
     text += f'[snmp]\nlisten = ["127.0.0.1:{snmp}"]\n'
     text += '[[snmp.community]]\nname = "public"\nsource = ["127.0.0.0/8"]\n'
     path.write_text(text + rest)

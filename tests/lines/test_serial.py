@@ -52,7 +52,10 @@ class Controller:
 
     def _readable(self) -> None:
         frame = os.read(self.master, 512)
-        if len(frame) != 8 or not crc_ok(frame) or frame[1] == Function.READ_IDENTIFICATION:
+        if not crc_ok(frame):
+            return
+        if frame[1] == Function.READ_IDENTIFICATION:
+            os.write(self.master, append_crc(bytes([frame[0], frame[1] | 0x80, 1])))
             return
         address, count = int.from_bytes(frame[2:4], "big"), int.from_bytes(frame[4:6], "big")
         words = b"".join(((address + self.base + i) & 0xFFFF).to_bytes(2, "big") for i in range(count))

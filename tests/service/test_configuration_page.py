@@ -25,6 +25,7 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "`[snmp]`": schema.SnmpTable,
     "`[[snmp.community]]`": schema.CommunityTable,
     "`[http]`": schema.HttpTable,
+    "`[history]`": schema.HistoryTable,
 }
 
 

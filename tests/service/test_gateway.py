@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 from ipaddress import ip_network
+from pathlib import Path
 
 import pytest
 
@@ -15,6 +16,7 @@ from gateway.service.gateway import Gateway
 from gateway.service.loops import Loop, loop_factory
 from gateway.service.schema import LineTable, PollTable
 from gateway.service.settings import (
+    history_settings,
     http_settings,
     line_budgets,
     line_devices,
@@ -127,6 +129,15 @@ def test_the_faces_get_their_settings(config: Config) -> None:
     assert http_settings(config).listen == (("127.0.0.1", 0),)
 
 
+def test_the_history_gets_its_settings() -> None:
+    text = f'state_dir = "/srv/gateway"\n{TEXT}[history]\ninterval_h = 6.0\n'
+    settings = history_settings(parse_config(text))
+    assert (settings.directory, settings.interval_s) == (Path("/srv/gateway"), 21600)
+    assert [keeper.name for keeper in Gateway(parse_config(text), SystemClock()).keepers] == ["history"]
+    off = text.replace("interval_h = 6.0", "enabled = false")
+    assert Gateway(parse_config(off), SystemClock()).keepers == ()
+
+
 def test_the_face_gives_up_before_the_supervisor_does(config: Config) -> None:
     from gateway.service.supervisor import STOP_LISTENERS_S
 
@@ -183,10 +194,11 @@ async def lifetime(config: Config) -> None:
 
 
 @pytest.mark.parametrize("choice", [Loop.ASYNCIO, Loop.UVLOOP, Loop.AUTO])
-def test_it_starts_and_stops_on_either_loop(choice: Loop) -> None:
+def test_it_starts_and_stops_on_either_loop(choice: Loop, tmp_path: Path) -> None:
     if choice is Loop.UVLOOP:
         pytest.importorskip("uvloop")
-    config = parse_config(TEXT.replace(', "[::1]:0"', "").replace("socket://192.0.2.1:4001", "/nonexistent/b"))
+    text = TEXT.replace(', "[::1]:0"', "").replace("socket://192.0.2.1:4001", "/nonexistent/b")
+    config = parse_config(f'state_dir = "{tmp_path}"\n{text}')
     with asyncio.Runner(loop_factory=loop_factory(choice)) as runner:
         runner.run(lifetime(config))
 

@@ -1,4 +1,4 @@
-"""The HTTP face: `/metrics`, `/sd`, `/healthz`, `/readyz` and an index page, all from memory.
+"""The HTTP face: `/metrics`, `/sd`, `/healthz`, `/readyz` and a page from memory, `/api/v1/log` from the history.
 
 Nothing here reads a line or waits for one, whatever is asked. `/healthz` answers as long as the loop runs;
 `/readyz` says whether the configuration is served as it stands, and is not about the controllers: one that
@@ -13,9 +13,12 @@ from collections.abc import Callable, Mapping, Sequence
 from aiohttp import hdrs, web
 
 from gateway.clock import Clock
+from gateway.core.daylog import DayLog
 from gateway.core.site import Site
-from gateway.core.stats import ModbusServerStats
+from gateway.core.stats import HistoryStats, ModbusServerStats
+from gateway.faces.http import api
 from gateway.faces.http.access import Access, guard
+from gateway.faces.http.api import LogApi
 from gateway.faces.http.discovery import targets
 from gateway.faces.http.exposition import Exposition, compressed
 from gateway.faces.http.listener import HttpListener
@@ -36,7 +39,7 @@ class HttpFace:
     """Metrics and health of one gateway.
 
     `modbus` and `snmp` are the counters of the other faces; `not_ready` gives the reasons why the gateway
-    is not ready, none when it is.
+    is not ready, none when it is; `history` and `log` are there where a history is kept.
     """
 
     def __init__(
@@ -48,13 +51,16 @@ class HttpFace:
         modbus: ModbusServerStats,
         snmp: Callable[[], Mapping[str, int]],
         not_ready: Callable[[], Sequence[str]],
+        history: HistoryStats | None = None,
+        log: DayLog | None = None,
     ) -> None:
         self._site = site
         self._clock = clock
         self._not_ready = not_ready
         self.stats = HttpStats()
         self._settings = settings
-        self._exposition = Exposition(site, clock, Counts(modbus, snmp, self.stats, not_ready))
+        self._exposition = Exposition(site, clock, Counts(modbus, snmp, self.stats, not_ready, history))
+        self._log_api = LogApi(site, log, settings.send_timeout_s)
         self.listeners: Sequence[HttpListener] = tuple(
             HttpListener(host, port, self._application, settings, self.stats) for host, port in settings.listen
         )
@@ -67,6 +73,7 @@ class HttpFace:
         application.router.add_get("/sd", self._discovery)
         application.router.add_get("/healthz", self._healthz)
         application.router.add_get("/readyz", self._readyz)
+        application.router.add_get(api.PATH, self._log_api.handle)
         return application
 
     async def _metrics(self, request: web.Request) -> web.StreamResponse:

@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 from gateway import __version__
 from gateway.clock import Clock
 from gateway.core.site import Site
-from gateway.core.stats import ModbusServerStats
+from gateway.core.stats import HistoryStats, ModbusServerStats
 from gateway.faces.http.devices import DEVICE_LABELS, device_labels
+from gateway.faces.http.history import DEVICE_HISTORY_RULES, STORE_RULES, DeviceHistoryView
 from gateway.faces.http.lines import DEVICE_RULES, LINE_LABELS, LINE_RULES, LineView
 from gateway.faces.http.metric import MetricInfo
 from gateway.faces.http.rules import Rule, Source, each, families, gateway_counter, gateway_gauge, one
@@ -114,7 +115,16 @@ HTTP_RULES: tuple[Rule[HttpStats], ...] = (
 
 OWN_METRICS: tuple[MetricInfo, ...] = tuple(
     rule.metric
-    for rules in (GATEWAY_RULES, LINE_RULES, DEVICE_RULES, MODBUS_RULES, SNMP_RULES, HTTP_RULES)
+    for rules in (
+        GATEWAY_RULES,
+        LINE_RULES,
+        DEVICE_RULES,
+        MODBUS_RULES,
+        SNMP_RULES,
+        HTTP_RULES,
+        STORE_RULES,
+        DEVICE_HISTORY_RULES,
+    )
     for rule in rules
 )
 """Every `prostar_gateway_*` metric; `process_*` and `python_gc_*` come from prometheus-client as they are."""
@@ -136,6 +146,7 @@ class Counts:
     snmp: Callable[[], Mapping[str, int]] = _no_events
     http: HttpStats = field(default_factory=HttpStats)
     not_ready: Callable[[], Sequence[str]] = _no_reasons
+    history: HistoryStats | None = None  # None: no history is kept
 
 
 class OwnMetrics:
@@ -157,3 +168,13 @@ class OwnMetrics:
         yield from families(MODBUS_RULES, [Source(counts.modbus)])
         yield from families(SNMP_RULES, [Source(counts.snmp())])
         yield from families(HTTP_RULES, [Source(counts.http)])
+        if counts.history is not None:
+            yield from families(STORE_RULES, [Source(counts.history)])
+            yield from families(DEVICE_HISTORY_RULES, self._histories(counts.history, now))
+
+    def _histories(self, history: HistoryStats, now: float) -> list[Source[DeviceHistoryView]]:
+        return [
+            Source(DeviceHistoryView(history.devices[device.of.unit_id], now), device.labels, device.written)
+            for device in self._devices
+            if device.of.unit_id in history.devices
+        ]

@@ -4,23 +4,29 @@ Rule 1: replies leave in the order of their requests. A request that waits for t
         what came after it on this connection, and nothing on any other.
 Rule 2: nothing grows without bound. While `MAX_WAITING` replies are due, or `MAX_UNSENT` bytes
         are not taken by the client, no further request is looked at and nothing is read.
-Rule 3: every request is answered, or its connection ends: framing lost or end of stream lets what came
-        before be answered first; a client that is gone has its questions withdrawn and gets nothing.
-Rule 4: no exception leaves this file. What was not foreseen is logged, counted, and ends the connection.
+Rule 3: every request is answered, or its connection ends, within `reply_timeout_s` of its arrival: framing lost or
+        end of stream lets what came before be answered first; a client that is gone has its questions withdrawn
+        and gets nothing; a server that stops answers 06 to what it has not begun.
+Rule 4: a client that asks more than it may is not read from for a while (core/ratelimit.py).
+Rule 5: no exception leaves this file. What was not foreseen is logged, counted, and ends the connection.
 
 The way in has two lanes. A whole request that `HotReplies` knows is answered in `data_received` with one
-lookup; everything else goes through the splitter and the dispatcher.
+lookup, paid with one of the client's tokens; everything else goes through the splitter and the dispatcher.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections import deque
 from collections.abc import Callable
 from typing import cast
 
+from gateway.core.clients import Client
+from gateway.core.ratelimit import ClientRate
 from gateway.core.site import Outcome, Ticket
+from gateway.errors import ShuttingDown
 from gateway.faces.modbus.dispatch import Dispatcher, Waiting
 from gateway.faces.modbus.settings import ModbusSettings
 from gateway.faces.modbus.tcp import client_name, keep_alive
@@ -34,6 +40,8 @@ MAX_BURST = 64  # hot replies joined into one write
 READ_SIZE = 12  # a read request on the wire: MBAP 7, function, address, quantity
 PIECE = 2048  # how much of a long segment is cut into requests at a time
 TURN = 256  # requests looked at before other connections have their turn
+AT_ONCE_S = 0.1
+NOBODY = Client("", ClientRate(), 0.0, 0.0)
 
 
 class _Due:
@@ -56,7 +64,7 @@ class Connection(asyncio.Protocol):
         self,
         dispatcher: Dispatcher,
         settings: ModbusSettings,
-        admit: Callable[[Connection, str], bool],
+        admit: Callable[[Connection, str], Client | None],
         left: Callable[[Connection], None],
     ) -> None:
         self._dispatcher = dispatcher
@@ -79,10 +87,14 @@ class Connection(asyncio.Protocol):
         self._ending = False  # no further request is taken; closes when all replies are out
         self._over = False  # closed, or about to be
         self._closing_since: float | None = None
-        self._resume: asyncio.Handle | None = None
+        self._resume: asyncio.Handle | None = None  # nothing is looked at before it has run
+        self._held_since: float | None = None  # something received waits to be looked at
+        self._unread_since = 0.0  # reading was paused then, and resumed at:
+        self._resumed_at = -math.inf
         self._unsent_since: float | None = None
         self._partial_since: float | None = None
         self.peer = ""  # the client's address, by which it is counted and has its share of a line
+        self.client = NOBODY
         self.seen = 0.0  # monotonic time of the last request
 
     # What asyncio calls
@@ -92,10 +104,12 @@ class Connection(asyncio.Protocol):
         self._transport = cast("asyncio.Transport", transport)
         self.seen = self._now()
         self.peer = client_name(transport.get_extra_info("peername"))
-        if not self._admit(self, self.peer):
+        client = self._admit(self, self.peer)
+        if client is None:
             self._over = True
             self._transport.abort()
             return
+        self.client = client
         keep_alive(transport)
         self._transport.set_write_buffer_limits(high=MAX_UNSENT)
         self._write = self._transport.write
@@ -105,19 +119,18 @@ class Connection(asyncio.Protocol):
         """Answer what can be answered now, in order."""
         try:
             if self._direct:
-                if len(data) == READ_SIZE:
-                    entry = self._find(data[2:])
-                    if entry is not None:
-                        valid_until, device, snapshot, reply = entry
-                        now = self._now()
-                        if now < valid_until and device.snapshot is snapshot:
-                            self.seen = now
-                            stats = self._stats
-                            stats.requests += 1
-                            stats.cache_hits += 1
-                            self._write(data[:2] + reply)
-                            return
-                else:
+                entry = self._find(data[2:])
+                if entry is not None:
+                    valid_until, device, snapshot, reply = entry
+                    now = self._now()
+                    client = self.client
+                    left = client.left
+                    if left and now < valid_until and device.snapshot is snapshot:
+                        client.left = left - 1
+                        self.seen = now
+                        self._write(data[:2] + reply)
+                        return
+                elif len(data) > READ_SIZE:
                     data = self._answer_hot(data)
             if data and not self._ending:
                 self._input += data
@@ -171,7 +184,10 @@ class Connection(asyncio.Protocol):
         settings = self._settings
         if self._closing_since is not None:
             return "not_reading" if now - self._closing_since > settings.write_timeout_s else None
-        if self._due and now - self._due[0].since > settings.reply_timeout_s:
+        since = self._due[0].since if self._due else self._held_since
+        if self._held_since is not None and since is not None:
+            since = min(since, self._held_since)
+        if since is not None and now - since > settings.reply_timeout_s:
             return "unanswered"
         if self._unsent_since is not None and now - self._unsent_since > settings.write_timeout_s:
             return "not_reading"
@@ -195,11 +211,36 @@ class Connection(asyncio.Protocol):
         self._over = True
 
     def finish(self) -> None:
-        """Take no further request, and close when those taken are answered."""
-        self._input = b""
-        self._adus.clear()
+        """Take no further request, answer 06 to those not begun, and close when all are answered."""
         self._ending = True
         self._direct = False
+        if self._resume is not None:
+            self._resume.cancel()
+            self._resume = None
+        self._guarded(self._refuse_the_rest)
+
+    def give_up(self) -> None:
+        """Wait no longer for what is under way: answer 06 to it, and close."""
+        for due in self._due:
+            if due.ticket is not None:
+                due.ticket.cancel()
+                due.ticket = None
+            if due.waiting is not None and due.reply is None:
+                unit, pdu = due.waiting.unit, due.waiting.pdu
+                due.reply = self._dispatcher.refuse(unit, pdu, self.client, ShuttingDown())
+        self._guarded(self._send_due)
+        self._guarded(self._settle)
+
+    def _refuse_the_rest(self) -> None:
+        now = self._now()
+        while not self._over and (self._adus or self._cut(now)):
+            adu = self._adus.popleft()
+            due = _Due(adu.tid.to_bytes(2), now)
+            due.reply = self._dispatcher.refuse(adu.unit, adu.pdu, self.client, ShuttingDown())
+            self._stats.requests += 1
+            self.client.unpaid += 1
+            self._due.append(due)
+        self._send_due()
         self._settle()
 
     # The way in
@@ -207,13 +248,15 @@ class Connection(asyncio.Protocol):
     def _answer_hot(self, data: bytes) -> bytes:
         """Answer requests from the front of a segment as long as each is known; returns the rest."""
         find = self._find
+        client = self.client
         now = self._now()
         size = len(data)
         at = 0
-        while self._direct:
+        while self._direct and client.lease(now):
             out: list[bytes] = []
             hits = 0
-            while hits < MAX_BURST and at + READ_SIZE <= size:
+            most = min(MAX_BURST, client.left)
+            while hits < most and at + READ_SIZE <= size:
                 entry = find(data[at + 2 : at + READ_SIZE])
                 if entry is None or now >= entry[0] or entry[1].snapshot is not entry[2]:
                     break
@@ -224,8 +267,7 @@ class Connection(asyncio.Protocol):
             if not hits:
                 break
             self.seen = now
-            self._stats.requests += hits
-            self._stats.cache_hits += hits
+            client.left -= hits
             self._write(b"".join(out))  # may call pause_writing, which ends the loop
         return data[at:] if at else data
 
@@ -243,6 +285,10 @@ class Connection(asyncio.Protocol):
             looked_at += 1
             self.seen = now
             self._take(self._adus.popleft(), now, out)
+            if self.client.pause_s:
+                pause_s, self.client.pause_s = self.client.pause_s, 0.0
+                self._resume = asyncio.get_running_loop().call_later(pause_s, self._work_on)
+                break
             if len(out) >= MAX_BURST:
                 self._write(b"".join(out))
                 out.clear()
@@ -251,7 +297,7 @@ class Connection(asyncio.Protocol):
         self._settle()
 
     def _work_on(self) -> None:
-        """Go on after the others had their turn."""
+        """Go on after the others had their turn, or a pause is over."""
         self._resume = None
         self._guarded(self._work)
 
@@ -284,7 +330,7 @@ class Connection(asyncio.Protocol):
     def _take(self, adu: Adu, now: float, out: list[bytes]) -> None:
         """Answer one request, or ask for its answer; what may leave now is put into `out`."""
         tid = adu.tid.to_bytes(2)
-        answer = self._dispatcher.answer(adu.unit, adu.pdu, self.peer, now)
+        answer = self._dispatcher.answer(adu.unit, adu.pdu, self.client, now)
         if isinstance(answer, bytes) and not self._due:
             out.append(tid)
             out.append(answer)
@@ -308,15 +354,20 @@ class Connection(asyncio.Protocol):
             return
         assert due.waiting is not None
         due.ticket = None
-        due.reply = self._dispatcher.conclude(due.waiting, outcome)
+        due.reply = self._dispatcher.conclude(due.waiting, self.client, outcome)
         if due is not self._due[0]:
             return
+        self._send_due()
+        self._work()
+
+    def _send_due(self) -> None:
+        """Send the replies whose turn it is (rule 1)."""
         out: list[bytes] = []
         while self._due and (reply := self._due[0].reply) is not None:
             out.append(self._due.popleft().tid)
             out.append(reply)
-        self._write(b"".join(out))
-        self._work()
+        if out:
+            self._write(b"".join(out))
 
     def _settle(self) -> None:
         """After any change: read on or pause, close when all is said."""
@@ -331,24 +382,38 @@ class Connection(asyncio.Protocol):
                 self._closing_since = self._now()
                 self._transport.close()
             return
-        self._set_reading(on=not waiting and self._unsent_since is None)
-        self._direct = not (
-            self._due or waiting or self._unsent_since is not None or self._splitter.pending or self._suspect
-        )
+        blocked = waiting or self._unsent_since is not None or self._resume is not None
+        self._hold(waiting=waiting)
+        self._set_reading(on=not blocked)
+        self._direct = not (self._due or blocked or self._splitter.pending or self._suspect)
+
+    def _hold(self, *, waiting: bool) -> None:
+        """Know since when something waits to be looked at (rule 3).
+
+        What comes as soon as reading is resumed may have waited in the kernel since it was paused.
+        """
+        if not waiting:
+            self._held_since = None
+        elif self._held_since is None:
+            now = self._now()
+            self._held_since = self._unread_since if now - self._resumed_at < AT_ONCE_S else now
 
     def _set_reading(self, *, on: bool) -> None:
         if self._transport is None or on is self._reading or self._transport.is_closing():
             return
         self._reading = on
+        now = self._now()
         if on:
+            self._resumed_at = now
             if self._partial_since is not None:
-                self._partial_since = self._now()  # it was our turn until now
+                self._partial_since = now  # it was our turn until now
             self._transport.resume_reading()
         else:
+            self._unread_since = now
             self._transport.pause_reading()
 
     def _guarded(self, step: Callable[[], None]) -> None:
-        """Rule 4."""
+        """Rule 5."""
         try:
             step()
         except Exception:

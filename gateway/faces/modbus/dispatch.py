@@ -1,6 +1,7 @@
 """From a request to its reply or to the question for the line: the table of design §6, without sockets.
 
 Order of the checks: unit id, function (policy), then `core.serving`, or for a write the rest of the policy.
+The rate limits come first for the client, and for device and line when it is certain that the line is needed.
 Every request that comes in here is counted once as a request, and once as a cache hit, as forwarded or as an
 exception; an exception that ends a forwarded request is counted under its code as well.
 """
@@ -12,13 +13,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from gateway.clock import Clock
+from gateway.core.clients import Client
 from gateway.core.policy import Audit, Reason, Refusal, decide
+from gateway.core.ratelimit import CLIENT, CLIENT_LINE, LineLimiter
 from gateway.core.serving import Ask, FromMemory, Serving
-from gateway.core.site import Outcome, Site, Ticket
+from gateway.core.site import Device, Outcome, Site, Ticket
 from gateway.core.stats import ModbusServerStats
 from gateway.core.write_rules import Requester
 from gateway.core.writing import Job
-from gateway.errors import IllegalFunction, RequestError, UnitNotRouted
+from gateway.errors import IllegalFunction, RateLimited, RequestError, UnitNotRouted
 from gateway.faces.modbus.hot import HotReplies
 from gateway.faces.modbus.settings import ModbusSettings
 from gateway.faces.modbus.writer import Writer
@@ -26,6 +29,8 @@ from gateway.modbus import mbap
 from gateway.modbus.pdu import exception_reply, is_exception
 
 logger = logging.getLogger(__name__)
+
+_OWN_LIMITS = (CLIENT, CLIENT_LINE)
 
 BROADCAST = 0
 RESERVED = range(248, 255)
@@ -99,27 +104,40 @@ class Routes:
         return _usable({s.device.address: s for s in self._serving if s.device.line.name == name})
 
 
+@dataclass(frozen=True, slots=True)
+class Shared:
+    """What all ways in have in common."""
+
+    stats: ModbusServerStats
+    audit: Audit
+    limiter: LineLimiter
+    writer: Writer | None  # None: nobody may write
+
+
 class Dispatcher:
     """The requests of one way in. Replies are ADUs without their transaction id."""
 
-    def __init__(
-        self,
-        routes: Mapping[int, Serving],
-        clock: Clock,
-        stats: ModbusServerStats,
-        audit: Audit,
-        writer: Writer | None = None,
-    ) -> None:
+    def __init__(self, routes: Mapping[int, Serving], clock: Clock, shared: Shared) -> None:
         self.hot = HotReplies()  # its keys hold the unit id, which means another device on another way in
-        self.stats = stats
+        self.stats = shared.stats
         self.now = clock.monotonic
-        self._audit = audit
+        self._audit = shared.audit
         self._routes = routes
-        self._writer = writer
+        self._limiter = shared.limiter
+        self._writer = shared.writer
 
-    def answer(self, unit: int, pdu: bytes, peer: str, now: float, role: str | None = None) -> bytes | Waiting:
-        """The reply to a request, or what its answer has to come from; `role`: that of the client's certificate."""
+    def answer(self, unit: int, pdu: bytes, client: Client, now: float, role: str | None = None) -> bytes | Waiting:
+        """The reply to a request, or what its answer has to come from; `role`: that of the client's certificate.
+
+        A client that asks more than it may has its `pause_s` set.
+        """
         self.stats.requests += 1
+        peer = client.name
+        if not client.lease(now):
+            client.unpaid += 1
+            return self.refuse(unit, pdu, client, self._limited(client, CLIENT, now))
+        client.left -= 1
+        client.slow += 1
         request = mbap.encode(0, unit, pdu)[2:]
         entry = self.hot.find(request)
         if entry is not None and now < entry[0] and entry[1].snapshot is entry[2]:
@@ -135,29 +153,38 @@ class Dispatcher:
             if not decision.allowed:
                 raise self._refused(Refusal(decision, IllegalFunction()), peer, unit, pdu, now)
             if decision.reason is Reason.WRITE and writer is not None:
+                self._check_rate(client, serving.device, now)
                 planned = writer.plan(serving.device, requester, pdu)
                 if isinstance(planned, Refusal):
                     raise self._refused(planned, peer, unit, pdu, now)
-                self.stats.forwarded += 1
+                self._forwarded(client)
                 return WriteOrder(unit, serving, planned, writer)
             answer = serving.answer(pdu, now)
+            if isinstance(answer, Ask):
+                self._check_rate(client, serving.device, now)
         except RequestError as error:
-            return self._exception(unit, pdu, error)
+            return self.refuse(unit, pdu, client, error)
         if isinstance(answer, FromMemory):
             self.stats.cache_hits += 1
             reply = mbap.encode(0, unit, answer.reply)[2:]
             self.hot.keep(request, serving.device, answer, reply)
             return reply
-        self.stats.forwarded += 1
+        self._forwarded(client)
         return Forward(unit, serving, answer)
 
-    def conclude(self, waiting: Waiting, outcome: Outcome) -> bytes:
+    def refuse(self, unit: int, pdu: bytes, client: Client, error: RequestError) -> bytes:
+        """The reply to a request that goes no further."""
+        client.refused += 1
+        return self._exception(unit, pdu, client, error)
+
+    def conclude(self, waiting: Waiting, client: Client, outcome: Outcome) -> bytes:
         """The reply to a request that had to wait, from what came of it."""
         if isinstance(outcome, RequestError):
-            return self._exception(waiting.unit, waiting.pdu, outcome)
+            return self._exception(waiting.unit, waiting.pdu, client, outcome)
         waiting.concluded(outcome)
         if is_exception(outcome):
             self.stats.exceptions[outcome[1]] += 1
+            client.exceptions[outcome[1]] += 1
         return mbap.encode(0, waiting.unit, outcome)[2:]
 
     def _refused(self, refusal: Refusal, peer: str, unit: int, pdu: bytes, now: float) -> RequestError:
@@ -166,8 +193,25 @@ class Dispatcher:
             logger.warning("%s", line)
         return refusal.error
 
-    def _exception(self, unit: int, pdu: bytes, error: RequestError) -> bytes:
+    def _check_rate(self, client: Client, device: Device, now: float) -> None:
+        limit = self._limiter.take(client.line_bucket, device, now)
+        if limit is not None:
+            raise self._limited(client, limit, now)
+
+    def _limited(self, client: Client, limit: str, now: float) -> RequestError:
+        self.stats.limited[limit] += 1
+        client.limited += 1
+        if limit in _OWN_LIMITS:
+            client.pause_s = (client.bucket if limit == CLIENT else client.line_bucket).pause_s(now)
+        return RateLimited(limit)
+
+    def _forwarded(self, client: Client) -> None:
+        self.stats.forwarded += 1
+        client.forwarded += 1
+
+    def _exception(self, unit: int, pdu: bytes, client: Client, error: RequestError) -> bytes:
         self.stats.exceptions[error.exception_code] += 1
+        client.exceptions[error.exception_code] += 1
         return mbap.encode(0, unit, exception_reply(pdu[0], error.exception_code))[2:]
 
 

@@ -1,12 +1,11 @@
 """The Modbus TCP face: its listeners, and which connections there are.
 
 Rule 1: a client that is not in `allow` is cut off before a byte of it is read.
-Rule 2: there are at most `max_connections`. Over that the connection that has been idle longest makes room when
-        it asked nothing for `evict_idle_s`; when all are at work the newcomer is refused.
+Rule 2: who gets in, and who makes room, is decided by admission.py.
 Rule 3: once a second every connection is asked whether it should end (idle, half a request, a client that
         takes no replies, a request nobody answers); the hot path sets no timers.
-Rule 4: a listener that stops takes no more connections, lets the requests under way be answered for
-        `stop_grace_s`, then cuts off.
+Rule 4: a listener that stops takes no more connections, answers 06 to what it has not begun, waits `stop_grace_s` for
+        what is under way, answers 06 to the rest of it, and closes; who does not take that is cut off.
 """
 
 from __future__ import annotations
@@ -18,17 +17,21 @@ from collections.abc import Sequence
 from functools import partial
 
 from gateway.clock import Clock
+from gateway.core.clients import Client, ClientTable
 from gateway.core.log_budget import LogBudget
 from gateway.core.policy import Audit
+from gateway.core.ratelimit import LineLimiter
 from gateway.core.site import Site
 from gateway.core.stats import ModbusServerStats
 from gateway.errors import ListenError
 from gateway.faces.modbus.accepting import Acceptor, listening_socket
+from gateway.faces.modbus.admission import decide, rate_of
 from gateway.faces.modbus.connection import Connection
-from gateway.faces.modbus.dispatch import Dispatcher, Routes
+from gateway.faces.modbus.dispatch import Dispatcher, Routes, Shared
 from gateway.faces.modbus.settings import ModbusSettings
 from gateway.faces.modbus.sockets import Hub, SocketTransport
-from gateway.faces.modbus.tcp import allowed, bind_problem
+from gateway.faces.modbus.tcp import bind_problem
+from gateway.faces.modbus.writer import Writer
 
 logger = logging.getLogger(__name__)
 
@@ -83,6 +86,9 @@ class Listener:
                     await self._empty.wait()
         except TimeoutError:
             for connection in tuple(self._connections):
+                connection.give_up()
+            await asyncio.sleep(0)
+            for connection in tuple(self._connections):
                 connection.end("stopped")
         finally:
             self._server.stopped(self)
@@ -112,10 +118,14 @@ class ModbusServer:
         self.hub = Hub()
         audit = Audit(stats.refused)
         routes = Routes(settings, site)
-        self.dispatcher = Dispatcher(routes.by_unit(), clock, stats, audit)
+        self.clients = ClientTable(stats, settings.rate.burst_s)
+        limiter = LineLimiter(settings.rate.lines, settings.rate.burst_s, site.devices)
+        self.writer = None if settings.writes is None else Writer(settings.writes, site, clock, stats, audit)
+        shared = Shared(stats, audit, limiter, self.writer)
+        self.dispatcher = Dispatcher(routes.by_unit(), clock, shared)
         listeners = [Listener(self, self.dispatcher, host, port) for host, port in settings.listen]
         for group in settings.lines:
-            dispatcher = Dispatcher(routes.of_line(group.line), clock, stats, audit)
+            dispatcher = Dispatcher(routes.of_line(group.line), clock, shared)
             listeners += [Listener(self, dispatcher, host, port, group.line) for host, port in group.listen]
         self.listeners: Sequence[Listener] = tuple(listeners)
         self._stats = stats
@@ -125,25 +135,34 @@ class ModbusServer:
         self._sweep: asyncio.TimerHandle | None = None
         self._refusals_told = LogBudget()
 
-    def admit(self, listener: Listener, connection: Connection, peer: str) -> bool:
-        """Whether a new connection may stay (rules 1 and 2)."""
+    def admit(self, listener: Listener, connection: Connection, peer: str) -> Client | None:
+        """Whose connection this is, when it may stay (rules 1 and 2)."""
+        now = self._now()
         self._stats.connections += 1
-        if not allowed(peer, self.settings.allow):
-            return self._refuse("not_allowed", peer)
-        if len(self._connections) >= self.settings.max_connections and not self._make_room():
-            return self._refuse("full", peer)
+        verdict = decide(self._connections, peer, self.settings, now)
+        if verdict.leaves is not None:
+            verdict.leaves.end("evicted")
+            self.left(verdict.leaves)
+        if verdict.refused is not None:
+            self._refuse(verdict.refused, peer)
+            return None
         self._connections.add(connection)
         self._stats.open_connections = len(self._connections)
         listener.joined(connection)
-        return True
+        return self.clients.arrived(peer, rate_of(peer, self.settings.rate), now)
 
     def left(self, connection: Connection) -> None:
         """A connection is over."""
+        if connection not in self._connections:
+            return
         self._connections.discard(connection)
         self._stats.open_connections = len(self._connections)
+        self.clients.left(connection.client, connection.seen)
 
     def started(self, listener: Listener) -> None:
         """A listener listens."""
+        if self.writer is not None and not self._listening:
+            self.writer.start()
         self._listening.add(listener)
         if self._sweep is None:
             self._sweep = asyncio.get_running_loop().call_later(SWEEP_S, self._sweep_again)
@@ -151,6 +170,8 @@ class ModbusServer:
     def stopped(self, listener: Listener) -> None:
         """A listener is closed."""
         self._listening.discard(listener)
+        if self.writer is not None and not self._listening:
+            self.writer.stop()
         if not self._listening and self._sweep is not None:
             self._sweep.cancel()
             self._sweep = None
@@ -158,6 +179,7 @@ class ModbusServer:
     def sweep(self) -> None:
         """End the connections whose time is up (rule 3)."""
         now = self._now()
+        self.clients.settle()
         for connection in tuple(self._connections):
             reason = connection.overdue(now)
             if reason is not None:
@@ -168,19 +190,9 @@ class ModbusServer:
         self._sweep = asyncio.get_running_loop().call_later(SWEEP_S, self._sweep_again)
         self.sweep()
 
-    def _make_room(self) -> bool:
-        idle = [connection for connection in self._connections if connection.idle]
-        oldest = min(idle, key=lambda connection: connection.seen, default=None)
-        if oldest is None or self._now() - oldest.seen < self.settings.evict_idle_s:
-            return False
-        oldest.end("evicted")
-        self.left(oldest)
-        return True
-
-    def _refuse(self, reason: str, peer: str) -> bool:
+    def _refuse(self, reason: str, peer: str) -> None:
         self._stats.refused_connections += 1
         self._stats.closed[reason] += 1
         left_out = self._refusals_told.spend((reason, peer), self._now())
         if left_out is not None:
             logger.warning("event=connection_refused peer=%s reason=%s left_out=%d", peer, reason, left_out)
-        return False

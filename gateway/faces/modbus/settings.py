@@ -6,12 +6,31 @@ from dataclasses import dataclass, field
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from pathlib import Path
 
+from gateway.core.ratelimit import ClientRate, LineRates
 from gateway.core.write_rules import WriteRule
 from gateway.core.write_wear import WearLimits
 
 Network = IPv4Network | IPv6Network
 
 LOOPBACK: tuple[Network, ...] = (ip_network("127.0.0.0/8"), ip_network("::1/128"))
+
+
+EVERYBODY = ClientRate()
+THIS_MACHINE = ClientRate(requests_per_s=0.0)
+LINES = LineRates()
+
+
+@dataclass(frozen=True, slots=True)
+class RateSettings:
+    """How often clients may ask; the first network that holds a client's address decides, else `client`.
+
+    What the gateway's own machine reads from memory is not limited: who is there can load the machine anyway.
+    """
+
+    client: ClientRate = EVERYBODY
+    lines: LineRates = LINES
+    burst_s: float = 2.0  # how many seconds' worth may come at once
+    networks: tuple[tuple[tuple[Network, ...], ClientRate], ...] = ((LOOPBACK, THIS_MACHINE),)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +57,10 @@ class ModbusSettings:
     listen: tuple[tuple[str, int], ...] = (("127.0.0.1", 1502),)
     lines: tuple[LineListen, ...] = ()
     max_connections: int = 64  # over it the longest idle connection makes room, else the newcomer is refused
+    max_per_client: int = 64  # the same for the connections of one client
     evict_idle_s: float = 10.0  # only a connection that asked nothing for so long has to make room
+    priority: tuple[Network, ...] = ()  # they always get in: any other connection makes room for them
+    rate: RateSettings = RateSettings()
     allow: tuple[Network, ...] = LOOPBACK
     max_age_s: float = 5.0  # `[cache] max_age_s`: older is never served from memory
     writes: WriteSettings | None = None  # None: every write is refused
@@ -46,5 +68,5 @@ class ModbusSettings:
     idle_timeout_s: float = 600.0  # no request for so long: the connection is closed
     frame_timeout_s: float = 5.0  # a request must be complete so long after its first byte
     write_timeout_s: float = 10.0  # a client that reads no replies for so long is cut off
-    reply_timeout_s: float = 60.0  # last resort: a request still unanswered ends its connection
+    reply_timeout_s: float = 60.0  # last resort: a request that is unanswered for so long ends its connection
     stop_grace_s: float = 2.0  # how long a stopping server waits for replies under way

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator
 
 import pytest
 
 from gateway import __version__
 from gateway.core.site import LineState, Site
-from gateway.core.stats import ModbusServerStats
+from gateway.core.stats import DeviceHistoryStats, HistoryStats, ModbusServerStats
 from gateway.faces.http.exposition import Exposition
 from gateway.faces.http.lines import ERROR_KINDS
 from gateway.faces.http.metric import MetricInfo, MetricKind
@@ -101,7 +102,9 @@ def test_what_is_collected_is_what_is_described(site: Site, clock: ManualClock) 
     line, device = site.lines[0], site.devices[0]
     line.stats.seconds_by_client["10.0.0.1"] = 1.0
     device.stats.refresh_s = 1.0
-    exposition = Exposition(site, clock, Counts(modbus, lambda: {"get": 1}))
+    of_device = DeviceHistoryStats(2, Counter(refused=1), days=256, apart=1, harvested_at=clock.now)
+    history = HistoryStats({11: of_device}, store_up=True, store_errors=Counter(full=1))
+    exposition = Exposition(site, clock, Counts(modbus, lambda: {"get": 1}, history=history))
 
     def collected() -> Iterator[tuple[str, str, str, set[str]]]:
         for family in parse(scrape(exposition)):

@@ -13,12 +13,13 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 
+from gateway.core.ratelimit import ClientRate, LineRates
 from gateway.core.site import Device, LineState, LineStatus, Outcome, Site
 from gateway.core.snapshot import Block, DeviceState, Snapshot
 from gateway.core.stats import LineStats, ModbusServerStats
 from gateway.devices.model import DeviceMap, Extent, IdentityRules, PollClass, Space
 from gateway.faces.modbus.server import ModbusServer
-from gateway.faces.modbus.settings import ModbusSettings
+from gateway.faces.modbus.settings import ModbusSettings, RateSettings
 from gateway.modbus import mbap
 from gateway.modbus.pdu import parse_read
 
@@ -62,6 +63,9 @@ def device_map() -> DeviceMap:
         log=None,
         identity=IdentityRules((), (), "", None, 0),
     )
+
+
+NO_LIMITS = RateSettings(ClientRate(0.0, 0.0), LineRates(0.0, 0.0), networks=())
 
 
 class FakeClock:
@@ -166,7 +170,15 @@ class World:
     clock: FakeClock
     lines: tuple[FakeLine, FakeLine]
     site: Site
-    stats: ModbusServerStats
+    counters: ModbusServerStats
+    servers: list[ModbusServer] = field(default_factory=list)
+
+    @property
+    def stats(self) -> ModbusServerStats:
+        """The counters, up to date."""
+        for server in self.servers:
+            server.clients.settle()
+        return self.counters
 
     def device(self, unit: int) -> Device:
         return self.site.by_unit[unit]
@@ -301,8 +313,9 @@ async def serve(world: World) -> AsyncIterator[Serve]:
     started: list[Running] = []
 
     async def start(**settings: object) -> Running:
-        values: dict[str, object] = {"listen": (("127.0.0.1", 0),), "stop_grace_s": 0.05, **settings}
-        server = ModbusServer(ModbusSettings(**values), world.site, world.clock, world.stats)  # type: ignore[arg-type]
+        values: dict[str, object] = {"listen": (("127.0.0.1", 0),), "stop_grace_s": 0.05, "rate": NO_LIMITS, **settings}
+        server = ModbusServer(ModbusSettings(**values), world.site, world.clock, world.counters)  # type: ignore[arg-type]
+        world.servers.append(server)
         for listener in server.listeners:
             await listener.start()
         running = Running(server, world)

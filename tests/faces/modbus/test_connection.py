@@ -349,8 +349,8 @@ async def test_stopping_does_not_wait_for_ever(serve: Serve, world: World) -> No
     client.send(GOOD)
     await running.until(lambda: len(world.line(12).waiting) == 1)
     await running.server.listeners[0].stop()
-    assert await client.rest() == b""
-    assert world.stats.closed == {"stopped": 1}
+    assert await client.rest() == mbap.encode(1, 12, b"\x83\x06")
+    assert not world.stats.closed
 
 
 async def test_a_stopped_listener_starts_again(running: Running) -> None:

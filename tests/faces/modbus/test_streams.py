@@ -95,6 +95,7 @@ async def exchange(world: World, stream: bytes, cuts: list[int]) -> tuple[list[m
     assert await after.query(12, bytes.fromhex("03 0000 0001")) == b"\x03\x02" + registers(2, 0, 1)
     await after.close()
     await listener.stop()
+    server.clients.settle()
     assert splitter.lost is None
     return replies, bytes(splitter.pending), stats
 

@@ -1,0 +1,37 @@
+"""The stored days for the faces: reads in threads, so that the loop never waits for a disk."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncGenerator
+from pathlib import Path
+
+from gateway.core.daylog import LogFormat, Selection
+from gateway.history.export import export
+from gateway.history.reader import HistoryReader
+
+
+class HistorySource:
+    """Satisfies `core.daylog.DayLog` for the history in one directory."""
+
+    def __init__(self, directory: Path, site: str) -> None:
+        self._directory = directory
+        self._site = site
+
+    async def devices(self) -> frozenset[str]:
+        """See `DayLog.devices`."""
+        return await asyncio.to_thread(self._devices)
+
+    async def export(self, form: LogFormat, selection: Selection) -> AsyncGenerator[bytes, None]:
+        """See `DayLog.export`."""
+        reader = await asyncio.to_thread(HistoryReader, self._directory)
+        try:
+            pieces = export(reader, form, selection, self._site)
+            while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
+                yield piece.encode()
+        finally:
+            await asyncio.to_thread(reader.close)
+
+    def _devices(self) -> frozenset[str]:
+        with HistoryReader(self._directory) as reader:
+            return reader.devices()
