@@ -57,7 +57,7 @@ format: $(VENV)/.dev ## Format the code and repair what ruff can repair.
 
 .PHONY: bench
 bench: setup ## Measure against the peers and print a table of ratios.
-	@for bench in tests/bench/bench_*.py; do $(BIN)/python "$$bench"; done
+	@for bench in tests/bench/bench_*.py; do PYTHONPATH=. $(BIN)/python "$$bench"; done
 
 .PHONY: setup
 setup: $(VENV)/.dev ## Make .venv and install the foreign programs that tests talk to.

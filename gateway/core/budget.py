@@ -12,12 +12,15 @@ from dataclasses import dataclass
 from gateway.core.settings import LineSettings
 from gateway.devices.model import DeviceMap, PollClass, Space
 from gateway.devices.plan import poll_plan
+from gateway.modbus.quarantine import MAX_WINDOW_S
 from gateway.modbus.rtu import Timing
 
 TURNAROUND_S = 0.015
 REQUEST_BYTES = 8
 REPLY_OVERHEAD_BYTES = 5
 LONGEST_FRAME_BYTES = 256
+WATCH_S = 1.0
+"""A face looks so often for requests that nobody has answered."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,11 +30,14 @@ class LineBudget:
     use_ratio: float
     live_refresh_s: float  # how often each device's live values will be read
     settings_refresh_s: float
-    reply_deadline_s: float  # a Modbus TCP client has its answer by then
+    reply_deadline_s: float  # a Modbus TCP client has its answer by then, or its connection is closed
 
 
-def line_budget(settings: LineSettings, maps: Sequence[DeviceMap]) -> LineBudget:
-    """Project the use of a line whose devices have these maps (one map a device)."""
+def line_budget(settings: LineSettings, maps: Sequence[DeviceMap], *, timeouts_s: Sequence[float] = ()) -> LineBudget:
+    """Project the use of a line whose devices have these maps (one map a device).
+
+    `timeouts_s` are the time-outs of the devices that have one of their own.
+    """
     timing = settings.timing()
     period_s = {PollClass.LIVE: settings.poll.live_s, PollClass.SETTINGS: settings.poll.settings_s}
     use = sum(
@@ -42,9 +48,9 @@ def line_budget(settings: LineSettings, maps: Sequence[DeviceMap]) -> LineBudget
     stretch = max(1.0, use)
     attempt_s = (
         timing.wire_s(REQUEST_BYTES)
-        + settings.reply_timeout_s
+        + max((settings.reply_timeout_s, *timeouts_s))
         + timing.wire_s(LONGEST_FRAME_BYTES)
-        + settings.quarantine_s
+        + max(settings.quarantine_s, MAX_WINDOW_S)  # late replies widen it (modbus/quarantine.py)
         + timing.gap_s
     )
     return LineBudget(
@@ -52,7 +58,7 @@ def line_budget(settings: LineSettings, maps: Sequence[DeviceMap]) -> LineBudget
         live_refresh_s=settings.poll.live_s * stretch,
         settings_refresh_s=settings.poll.settings_s * stretch,
         # One transaction may be under way when the queue time ends; before each try there may be a settling question.
-        reply_deadline_s=settings.queue_limit_s + (2 * (settings.retries + 1) + 1) * attempt_s,
+        reply_deadline_s=settings.queue_limit_s + (2 * (settings.retries + 1) + 1) * attempt_s + WATCH_S,
     )
 
 

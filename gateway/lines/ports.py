@@ -43,7 +43,7 @@ def open_port(settings: LineSettings) -> serial.Serial:
     network = is_network(settings.port)
     try:
         port: serial.Serial = serial.serial_for_url(
-            settings.port,
+            _url(settings.port),
             baudrate=settings.baudrate,
             bytesize=settings.bytesize,
             parity=settings.parity,
@@ -74,6 +74,16 @@ def close_port(port: serial.Serial) -> None:
         port.close()
     if connection is not None:  # pyserial leaves it open when the other end was gone already
         connection.close()
+
+
+def _url(port: str) -> str:
+    """The port as pyserial is given it.
+
+    Servers answer to modem lines that a port lacks with silence; nothing here depends on that answer.
+    """
+    if not port.startswith("rfc2217://") or "ign_set_control" in port:
+        return port
+    return f"{port}{'&' if '?' in port else '?'}ign_set_control"
 
 
 def _tell_empty_from_gone(port: serial.Serial) -> None:

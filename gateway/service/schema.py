@@ -149,6 +149,10 @@ class DeviceTable(Table):
             "Another reading of a point than the document's, for units that differ from it.",
         ),
     ] = Field(default_factory=dict)
+    reply_timeout_s: Annotated[
+        Seconds | None,
+        Key("0.05 to 10.0", "How long this controller may take before its reply begins; left out: as its line says."),
+    ] = Field(default=None, ge=0.05, le=10.0)
     product: Annotated[
         Annotated[str, Field(pattern=r"^[!-~]([ -~]{0,62}[!-~])?$")] | None,
         Key(

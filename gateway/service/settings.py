@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 from pathlib import Path
 
-from gateway.core.budget import LineBudget, line_budget
+from gateway.core.budget import WATCH_S, LineBudget, line_budget
 from gateway.core.identity import Identity
 from gateway.core.settings import LineSettings, PollSettings
 from gateway.core.site import Device
@@ -56,6 +56,7 @@ def line_devices(line: LineTable) -> tuple[Device, ...]:
             map=load_map(device.model),
             decode=dict(device.decode),
             expected=Identity(product=device.product, serial_number=device.serial_number),
+            reply_timeout_s=device.reply_timeout_s,
         )
         for device in line.device
     )
@@ -64,7 +65,11 @@ def line_devices(line: LineTable) -> tuple[Device, ...]:
 def line_budgets(config: Config) -> tuple[LineBudget, ...]:
     """What each line can carry, in the order of the file."""
     return tuple(
-        line_budget(settings, [load_map(device.model) for device in line.device])
+        line_budget(
+            settings,
+            [load_map(device.model) for device in line.device],
+            timeouts_s=[device.reply_timeout_s for device in line.device if device.reply_timeout_s is not None],
+        )
         for settings, line in zip(line_settings(config), config.line, strict=True)
     )
 
@@ -72,6 +77,7 @@ def line_budgets(config: Config) -> tuple[LineBudget, ...]:
 def modbus_settings(config: Config) -> ModbusSettings:
     """The settings of the Modbus TCP face."""
     modbus = config.modbus
+    deadline_s = max(budget.reply_deadline_s for budget in line_budgets(config))
     return ModbusSettings(
         listen=_pairs(modbus.listen),
         lines=tuple(LineListen(_pairs(listener.listen), listener.line) for listener in modbus.listener),
@@ -79,6 +85,7 @@ def modbus_settings(config: Config) -> ModbusSettings:
         allow=tuple(ipaddress.ip_network(network) for network in modbus.allow),
         max_age_s=config.cache.max_age_s,
         strict_map=modbus.strict_map,
+        reply_timeout_s=deadline_s - WATCH_S,
         stop_grace_s=STOP_GRACE_S,
     )
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import fcntl
 import os
 import pty
+import time
 import tty
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
@@ -14,14 +14,13 @@ from pathlib import Path
 import pytest
 
 from gateway.clock import SystemClock
-from gateway.core.settings import LineSettings
 from gateway.core.site import Device, LineState, Outcome
 from gateway.core.snapshot import DeviceState
 from gateway.devices.schema import load_map
 from gateway.errors import LineDown
-from gateway.lines.serial import SerialLine
 from gateway.modbus.crc import append_crc, crc_ok
 from gateway.modbus.pdu import Function, ReadRequest
+from tests.lines.rig import ask, make_line, running, until
 
 
 class Controller:
@@ -75,36 +74,6 @@ async def controller(tmp_path: Path) -> AsyncIterator[Controller]:
 @pytest.fixture
 def device() -> Device:
     return Device("array-1", 11, 1, load_map("prostar-mppt"))
-
-
-@contextlib.asynccontextmanager
-async def running(line: SerialLine) -> AsyncIterator[SerialLine]:
-    task = asyncio.create_task(line.run())
-    try:
-        yield line
-    finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-
-def make_line(port: Path | str, device: Device, **settings: object) -> SerialLine:
-    line_settings = LineSettings(name="shelter-a", index=1, port=str(port), reply_timeout_s=0.1, **settings)  # type: ignore[arg-type]  # the tests' own calls
-    return SerialLine(line_settings, [device], SystemClock())
-
-
-async def until(condition: Callable[[], bool], limit_s: float = 10.0) -> None:
-    """Wait for a state that only the outside world brings about."""
-    async with asyncio.timeout(limit_s):
-        while not condition():  # noqa: ASYNC110  # the snapshot is replaced without an event
-            await asyncio.sleep(0.01)
-
-
-async def ask(line: SerialLine, device: Device, address: int, count: int = 1) -> Outcome:
-    done: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
-    line.read(device, ReadRequest(Function.READ_HOLDING_REGISTERS, address, count).encode(), done.set_result)
-    async with asyncio.timeout(5):
-        return await done
 
 
 async def test_a_device_is_polled_and_a_client_read_is_answered(controller: Controller, device: Device) -> None:
@@ -230,3 +199,17 @@ async def test_rtu_over_tcp_by_a_pyserial_url(controller: Controller, device: De
         assert await ask(line, device, 9, 1) == bytes.fromhex("03 02 0009")
         server.close()
     await server.wait_closed()
+
+
+async def test_an_unplugged_line_costs_next_to_nothing_and_says_little(
+    controller: Controller, device: Device, caplog: pytest.LogCaptureFixture
+) -> None:  # F16
+    async with running(make_line(controller.link, device)) as line:
+        await until(lambda: device.snapshot.state is DeviceState.ONLINE)
+        controller.unplug()
+        await until(lambda: line.status(0.0).state is LineState.DOWN)
+        used, began = time.process_time(), time.monotonic()
+        await asyncio.sleep(2.0)
+        assert time.process_time() - used < 0.05 * (time.monotonic() - began)
+    assert sum("event=line_down" in message for message in caplog.messages) <= 2  # lost, and then not there
+    assert not any(record.exc_info for record in caplog.records)

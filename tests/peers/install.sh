@@ -7,7 +7,7 @@
 # Exit 0: all are there. Exit 3: some are missing and may not be installed here (neither root nor
 # passwordless sudo, or no apt-get); they are named on stderr. Any other exit: apt-get failed.
 #
-# Debian starts and enables the services of prometheus and snmpd when it installs them. The tests only
+# Debian starts and enables the services of prometheus, snmpd and ser2net when it installs them. The tests only
 # want the programs, and a second snmpd on a user's machine is a surprise. So starting is forbidden while
 # apt runs (a policy-rc.d, Debian Policy 9.3.3.1, removed again; one that is already there is left
 # alone), and units that came with this run are disabled afterwards. Services that were there before are
@@ -22,12 +22,14 @@ peers=(
   "prometheus prometheus"
   "smitools smilint"
   "socat socat"
+  "ser2net ser2net"
   "curl curl"
   "iproute2 ip"
   "gcc cc"
   "libc6-dev /usr/include/stdio.h"
   "pkg-config pkg-config"
   "libmodbus-dev /usr/include/modbus/modbus.h"
+  "libsnmp-dev /usr/include/net-snmp/net-snmp-config.h"
 )
 policy=/usr/sbin/policy-rc.d
 export PATH="$PATH:/usr/local/sbin:/usr/sbin:/sbin"
@@ -109,7 +111,7 @@ fi
 if [[ -d /run/systemd/system ]]; then
   for package in "${missing[@]}"; do
     case $package in
-      prometheus | snmpd) "${root[@]}" systemctl disable --now --quiet "$package.service" || true ;;
+      prometheus | snmpd | ser2net) "${root[@]}" systemctl disable --now --quiet "$package.service" || true ;;
     esac
   done
 fi

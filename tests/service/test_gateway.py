@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from gateway.clock import SystemClock
+from gateway.core.budget import WATCH_S
 from gateway.core.identity import Identity
 from gateway.service.config import Config, parse_config
 from gateway.service.gateway import Gateway
@@ -173,6 +174,7 @@ def test_a_line_with_more_devices_is_used_more(config: Config) -> None:
     first, second = line_budgets(config)
     assert 0 < second.use_ratio < first.use_ratio < 1
     assert first.reply_deadline_s < second.reply_deadline_s  # shorter queue and time-out, one retry less
+    assert modbus_settings(config).reply_timeout_s == second.reply_deadline_s - WATCH_S
 
 
 async def lifetime(config: Config) -> None:

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from gateway.clock import Clock
+from gateway.core.budget import WATCH_S
 from gateway.core.clients import Client, ClientTable
 from gateway.core.log_budget import LogBudget
 from gateway.core.policy import Audit
@@ -34,8 +35,6 @@ from gateway.faces.modbus.tcp import bind_problem
 from gateway.faces.modbus.writer import Writer
 
 logger = logging.getLogger(__name__)
-
-SWEEP_S = 1.0
 
 
 class Listener:
@@ -165,7 +164,7 @@ class ModbusServer:
             self.writer.start()
         self._listening.add(listener)
         if self._sweep is None:
-            self._sweep = asyncio.get_running_loop().call_later(SWEEP_S, self._sweep_again)
+            self._sweep = asyncio.get_running_loop().call_later(WATCH_S, self._sweep_again)
 
     def stopped(self, listener: Listener) -> None:
         """A listener is closed."""
@@ -187,7 +186,7 @@ class ModbusServer:
                 connection.end(reason)
 
     def _sweep_again(self) -> None:
-        self._sweep = asyncio.get_running_loop().call_later(SWEEP_S, self._sweep_again)
+        self._sweep = asyncio.get_running_loop().call_later(WATCH_S, self._sweep_again)
         self.sweep()
 
     def _refuse(self, reason: str, peer: str) -> None:

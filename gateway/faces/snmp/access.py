@@ -13,6 +13,7 @@ when a view has no entries. Here the rule is one look-up that ends in "no" unles
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from ipaddress import IPv4Address, IPv6Address, ip_address
 
@@ -39,7 +40,7 @@ def source_address(host: str) -> Address:
 class Source:
     """An address that may ask, and what it may use."""
 
-    __slots__ = ("_at", "_left", "_most", "_rate", "communities", "host", "users")
+    __slots__ = ("_at", "_most", "_rate", "communities", "host", "left", "users")
 
     def __init__(
         self, host: str, communities: Mapping[bytes, Windows], users: Mapping[bytes, Windows], rate: float
@@ -48,19 +49,20 @@ class Source:
         self.communities = communities
         self.users = users
         self._rate = rate
-        self._most = self._left = max(1.0, rate * BURST_S)
-        self._at = 0.0
+        self._most = self.left = max(1.0, rate * BURST_S)  # requests that it may still make
+        self._at = -math.inf
 
     def take(self, now: float) -> bool:
         """Use up one request of the allowance; False when there is none left."""
-        left = self._left + (now - self._at) * self._rate
-        self._at = now
-        if left >= self._most:
-            left = self._most
-        elif left < 1.0:
-            self._left = left
-            return False
-        self._left = left - 1.0
+        if self.left < 1.0:
+            # What has come back meanwhile is looked at only now.
+            self.left = min(self._most, self.left + (now - self._at) * self._rate)
+            self._at = now
+            if self.left < 1.0:
+                return False
+        elif self._at == -math.inf:
+            self._at = now
+        self.left -= 1.0
         return True
 
 
@@ -78,32 +80,33 @@ class Access:
         self._communities = [(each.name.encode(), each.sources, windows(each.view)) for each in communities]
         self._users = [(each.credentials.name, each.sources, windows(each.view)) for each in users]
         self._requests_per_s = requests_per_s
-        self._known: dict[str, Source | None] = {}
+        self._combinations: dict[tuple[tuple[bytes, int], ...], dict[bytes, Windows]] = {}
+        self.known: dict[str, Source | None] = {}
 
     def source(self, host: str) -> Source | None:
         """What may be used from `host`, None when nothing."""
         try:
-            return self._known[host]
+            return self.known[host]
         except KeyError:
             return self._learn(host)
 
     def _learn(self, host: str) -> Source | None:
         address = source_address(host)
-        communities = _usable(self._communities, address)
-        users = _usable(self._users, address)
+        communities = self._usable(self._communities, address)
+        users = self._usable(self._users, address)
         source = Source(host, communities, users, self._requests_per_s) if communities or users else None
-        if len(self._known) >= SOURCES_KEPT:
-            del self._known[next(iter(self._known))]
-        self._known[host] = source
+        if len(self.known) >= SOURCES_KEPT:
+            del self.known[next(iter(self.known))]
+        self.known[host] = source
         return source
 
-
-def _usable(
-    credentials: Iterable[tuple[bytes, tuple[Network, ...], Windows]], address: Address
-) -> dict[bytes, Windows]:
-    """Of a name that is given twice, the first that lists the address counts."""
-    usable: dict[bytes, Windows] = {}
-    for name, networks, windows in credentials:
-        if any(address in network for network in networks):
-            usable.setdefault(name, windows)
-    return usable
+    def _usable(
+        self, credentials: Iterable[tuple[bytes, tuple[Network, ...], Windows]], address: Address
+    ) -> dict[bytes, Windows]:
+        """The credentials that list the address; the same object for all addresses that may use the same ones."""
+        usable: dict[bytes, Windows] = {}
+        for name, networks, windows in credentials:
+            if any(address in network for network in networks):
+                usable.setdefault(name, windows)  # of a name that is given twice, the first counts
+        same = tuple((name, id(windows)) for name, windows in usable.items())
+        return self._combinations.setdefault(same, usable)

@@ -109,25 +109,37 @@ class SnmpAgent:
 
     def answer_waiting(self, sock: socket.socket, context: bytes = b"") -> None:
         """Answer what waits in the socket, for one turn."""
-        monotonic = self._clock.monotonic
-        until = monotonic() + TURN_S
+        monotonic, again = self._clock.monotonic, self._responder.again
+        now = monotonic()
+        until = now + TURN_S
+        known = 0
         while True:
             try:
                 data, address = sock.recvfrom(DATAGRAM_LIMIT + 1)
             except (BlockingIOError, InterruptedError):
-                return
+                break
             except OSError as error:
                 # An asker that is gone by now (ICMP port unreachable); nothing of ours is wrong.
                 _log.debug("event=snmp_receive_failed reason=%s", error)
                 continue
-            reply = self.answer(data, address[0], context)
+            reply = None if context else again(data, address[0], now)
+            if reply is not None:
+                known += 1
+            else:
+                self.counters.in_packets += known
+                self.counters.responses += known
+                known = 0
+                reply = self.answer(data, address[0], context)
             if reply is not None:
                 try:
                     sock.sendto(reply, address)
                 except OSError:
                     self.counters.send_failures += 1
-            if monotonic() >= until:
-                return
+            now = monotonic()
+            if now >= until:
+                break
+        self.counters.in_packets += known
+        self.counters.responses += known
 
     def _warm_up(self) -> None:
         """Encode every cell and answer every kind of request once, so that no first request waits for it."""

@@ -48,13 +48,14 @@ class Unusual(ValueError):
 class Request:
     """A PDU of one of the four kinds that an agent answers."""
 
-    __slots__ = ("first", "kind", "names", "request_id", "second", "varbinds")
+    __slots__ = ("first", "id_at", "kind", "names", "request_id", "second", "varbinds")
 
     def __init__(
         self, kind: int, request_id: bytes, counts: tuple[int, int], names: list[bytes], varbinds: bytes
     ) -> None:
         self.kind = kind
         self.request_id = request_id  # encoded INTEGER
+        self.id_at = 0  # where the octets of the id are in what was read; 0 when it is not known
         self.first, self.second = counts  # non-repeaters and max-repetitions of GETBULK
         self.names = names  # encoded OBJECT IDENTIFIERs
         self.varbinds = varbinds  # as they came, encoded, one after the other
@@ -138,8 +139,8 @@ def plain_request(data: bytes, at: int) -> Request:
         request_id = data[start:at]
         counts = (0, 0)
         if kind == GET_BULK:
-            (non_repeaters, at), start = _count(data, at), at
-            (repetitions, at) = _count(data, at)
+            non_repeaters, at = _count(data, at)
+            repetitions, at = _count(data, at)
             counts = (non_repeaters, repetitions)
         elif data[at : at + 6] == _ZEROS:
             at += 6
@@ -165,7 +166,16 @@ def plain_request(data: bytes, at: int) -> Request:
             at = stop + 2
     except IndexError:
         raise Unusual("truncated") from None
-    return Request(kind, request_id, counts, names, data[first:end])
+    request = Request(kind, request_id, counts, names, data[first:end])
+    request.id_at = start + 2
+    return request
+
+
+def id_place(data: bytes, at: int) -> tuple[int, int]:
+    """Where the octets of the request id are, and how many, in the PDU at `at`, if there is one; IndexError if not."""
+    size = data[at + 1]
+    at += 4 if size < 0x80 else size - 0x7C
+    return at, data[at - 1]
 
 
 def _inside(data: bytes, at: int, end: int) -> int:

@@ -16,6 +16,7 @@ from enum import Enum
 
 from gateway.faces.snmp import reader, v3, wire
 from gateway.faces.snmp.access import Access, Source, Windows
+from gateway.faces.snmp.answers import Answer, Answers
 from gateway.faces.snmp.counters import SnmpCounters
 from gateway.faces.snmp.reader import NotSnmp, Request, Unusual
 from gateway.faces.snmp.security import Rejected, Rejection, Security
@@ -27,18 +28,8 @@ _log = logging.getLogger(__name__)
 DATAGRAM_LIMIT = 1472
 """Octets in one Ethernet frame after IPv4 and UDP headers; no request needs more."""
 
-_PDU_GROWTH = 32
-"""Octets of a reply around request id, community and varbinds, at most."""
-
-
-class ErrorStatus(Enum):
-    """Values of error-status that we send (RFC 3416 §3)."""
-
-    NO_ERROR = 0
-    TOO_BIG = 1
-    NO_SUCH_NAME = 2
-    GEN_ERR = 5
-    NOT_WRITABLE = 17
+_PDU_GROWTH = 38
+"""Octets of a reply around community and varbinds, at most."""
 
 
 class Refusal(Enum):
@@ -78,6 +69,9 @@ class Responder:
         self._contexts = contexts
         self._windows: dict[View, Windows] = {}
         self._access = Access(settings.communities, settings.users, self._windows_of, settings.requests_per_s)
+        self._sources = self._access.known
+        self._answers = Answers()
+        self._kept = self._answers.kept
         self._counters = counters
         self._v1 = settings.v1
         self._limit = settings.reply_octets
@@ -118,10 +112,38 @@ class Responder:
             raise Refused(Refusal.COMMUNITY)
         request = self._request(data, at, version)
         head = data[start:at]
-        room = self._limit - len(head) - len(request.request_id) - _PDU_GROWTH
-        reply = wire.tlv(0x30, head + self._pdu(window, request, version, now, room))
+        room = self._limit - len(head) - _PDU_GROWTH
+        answer = self._read(Answer(window, request, version, room=room, head=head, grant=source.communities), now)
         counters.responses += 1
-        return reply
+        if answer.lasting and request.id_at and not context:
+            self._answers.keep(_without_id(data, request), answer)
+        return answer.before + request.request_id[2:] + answer.after
+
+    def again(self, data: bytes, host: str, now: float) -> bytes | None:
+        """The reply to a request of a community that was answered before in the default context; the caller counts it.
+
+        None when it is not known: `answer` has to look at it.
+        """
+        source = self._sources.get(host)
+        if source is None or source.left < 1.0:
+            return None
+        try:
+            if data[1] < 0x80:
+                at = data[6] + 11
+                size = data[at - 1]
+            else:
+                first = data[1] - 0x7E
+                at, size = reader.id_place(data, first + 5 + data[first + 4])
+        except IndexError:
+            return None
+        key = data[:at] + data[at + size :]
+        answer = self._kept.get(key)
+        if answer is None or answer.grant is not source.communities:
+            return None
+        if not answer.holds() and not self._renewed(key, answer, now):
+            return None
+        source.left -= 1.0
+        return answer.before + data[at : at + size] + answer.after
 
     def rehearse(self, now: float) -> None:
         """Answer one request of each kind to nobody, so that the first real one finds everything loaded."""
@@ -134,7 +156,10 @@ class Responder:
                 except Unusual:
                     continue
                 assert request is not None
-                self._pdu(self._contexts[b""], request, reader.VERSION_2C, now, self._limit)
+                answer = Answer(
+                    self._contexts[b""], request, reader.VERSION_2C, room=self._limit, head=None, grant=None
+                )
+                answer.read(self._counters, now)
 
     def _secure(self, security: Security, message: v3.Message, source: Source, now: float, context: bytes) -> bytes:
         try:
@@ -146,11 +171,47 @@ class Responder:
             if rejected.rejection is Rejection.DIGEST:
                 self.on_authentication_failure(source.host)
             raise Refused(rejected.rejection, rejected.report) from None
-        request = self._request(opened.plain, opened.scope.pdu_at, reader.VERSION_3)
-        room = min(self._limit, message.max_size) - len(request.request_id) - _PDU_GROWTH - security.overhead(opened)
-        reply = security.reply(opened, self._pdu(window, request, reader.VERSION_3, now, room), now)
+        plain, at = opened.plain, opened.scope.pdu_at
+        room = min(self._limit, message.max_size) - _PDU_GROWTH - security.overhead(opened)
+        pdu = self._pdu_again(plain, at, window, room, now)
+        if pdu is None:
+            request = self._request(plain, at, reader.VERSION_3)
+            answer = self._read(Answer(window, request, reader.VERSION_3, room=room, head=None, grant=window), now)
+            if answer.lasting and request.id_at:
+                self._answers.keep(_without_id(plain, request), answer)
+            pdu = answer.before + request.request_id[2:] + answer.after
+        reply = security.reply(opened, pdu, now)
         self._counters.responses += 1
         return reply
+
+    def _pdu_again(self, plain: bytes, at: int, window: Window, room: int, now: float) -> bytes | None:
+        """The Response to a scoped PDU whose own PDU begins at `at`, if it was answered before."""
+        try:
+            at, size = reader.id_place(plain, at)
+        except IndexError:
+            return None
+        key = plain[:at] + plain[at + size :]
+        answer = self._kept.get(key)
+        if answer is None or answer.grant is not window or answer.room != room:
+            return None
+        if not answer.holds() and not self._renewed(key, answer, now):
+            return None
+        return answer.before + plain[at : at + size] + answer.after
+
+    def _renewed(self, key: bytes, answer: Answer, now: float) -> bool:
+        """Read anew for an answer whose devices have changed; False when it cannot be kept any more."""
+        answer.read(self._counters, now)
+        if not answer.lasting:
+            self._answers.drop(key)
+        return answer.lasting
+
+    def _read(self, answer: Answer, now: float) -> Answer:
+        try:
+            answer.read(self._counters, now)
+        except NotSnmp as error:
+            self._counters.parse_errors += 1
+            raise Refused(Refusal.MALFORMED) from error
+        return answer
 
     def _windows_of(self, view: View) -> Windows:
         """What a view shows of each context; made once a view."""
@@ -188,95 +249,6 @@ class Responder:
             raise Refused(Refusal.PDU_TYPE)
         return request
 
-    def _pdu(self, window: Window, request: Request, version: int, now: float, room: int) -> bytes:
-        """The Response to a request, with varbinds of at most `room` octets."""
-        window.refresh()
-        status, index = ErrorStatus.NO_ERROR, 0
-        varbinds: bytes | None
-        try:
-            if request.kind == reader.SET:
-                self._counters.bad_community_uses += 1
-                status, index = ErrorStatus.NOT_WRITABLE, min(1, len(request.names))
-                varbinds = request.varbinds
-            elif request.kind == reader.GET_BULK:
-                varbinds = _bulk(window, request, now, room)
-            else:
-                each = _get if request.kind == reader.GET else _next
-                found = [each(window, name, now) for name in request.names]
-                if version == reader.VERSION_1:
-                    index = next((at for at, (_, there) in enumerate(found, 1) if not there), 0)
-                    status = ErrorStatus.NO_SUCH_NAME if index else status
-                varbinds = b"".join([varbind for varbind, _ in found])
-        except NotSnmp as error:
-            self._counters.parse_errors += 1
-            raise Refused(Refusal.MALFORMED) from error
-        except Exception:  # noqa: BLE001 - logged with its traceback
-            # The datagram edge: a defect of ours must not cost the asker its reply.
-            self._counters.internal_errors += 1
-            _log.exception("event=snmp_internal_error")
-            status, index, varbinds = ErrorStatus.GEN_ERR, 0, b""
-        if varbinds is None or len(varbinds) > room:
-            status, index, varbinds = ErrorStatus.TOO_BIG, 0, b""
-        if version == reader.VERSION_1 and status is not ErrorStatus.NO_ERROR:
-            # RFC 1157 §4.1: an error comes with what was asked; notWritable does not exist.
-            status = ErrorStatus.NO_SUCH_NAME if status is ErrorStatus.NOT_WRITABLE else status
-            varbinds = request.varbinds
-        return wire.response(request.request_id, status.value, index, varbinds)
 
-
-def _get(window: Window, name: bytes, now: float) -> tuple[bytes, bool]:
-    """The varbind for a name, and whether it has a value."""
-    place = window.places.get(name)
-    if place is not None:
-        varbind = window.slots[place].varbind(now)
-        if varbind is not None:
-            return varbind, True
-        return wire.varbind(name, wire.NO_SUCH_INSTANCE), False
-    missing = wire.NO_SUCH_INSTANCE if window.has_object(reader.oid(name)) else wire.NO_SUCH_OBJECT
-    return wire.varbind(name, missing), False
-
-
-def _next(window: Window, name: bytes, now: float) -> tuple[bytes, bool]:
-    """The varbind behind a name, and whether there is one."""
-    found = window.from_place(_behind(window, name), now)
-    return (wire.varbind(name, wire.END_OF_MIB_VIEW), False) if found is None else (found[1], True)
-
-
-def _behind(window: Window, name: bytes) -> int:
-    place = window.places.get(name)
-    return window.place_after(reader.oid(name)) if place is None else place + 1
-
-
-def _bulk(window: Window, request: Request, now: float, room: int) -> bytes | None:
-    """As many varbinds as fit, in the order of RFC 3416 §4.2.3; None when not even the first does."""
-    names = request.names
-    single = min(request.first, len(names)) if request.first > 0 else 0
-    out: list[bytes] = []
-    left = room
-    for name in names[:single]:
-        varbind = _next(window, name, now)[0]
-        left -= len(varbind)
-        if left < 0:
-            return b"".join(out) if out else None
-        out.append(varbind)
-    repeaters = names[single:]
-    places = [_behind(window, name) for name in repeaters]
-    from_place = window.from_place
-    for _ in range(request.second if repeaters else 0):
-        ended = True
-        for position, place in enumerate(places):
-            found = from_place(place, now)
-            if found is None:
-                varbind = wire.varbind(repeaters[position], wire.END_OF_MIB_VIEW)
-            else:
-                at, varbind = found
-                places[position] = at + 1
-                repeaters[position] = window.slots[at].name
-                ended = False
-            left -= len(varbind)
-            if left < 0:
-                return b"".join(out) if out else None
-            out.append(varbind)
-        if ended:
-            break
-    return b"".join(out)
+def _without_id(data: bytes, request: Request) -> bytes:
+    return data[: request.id_at] + data[request.id_at + len(request.request_id) - 2 :]

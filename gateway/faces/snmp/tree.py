@@ -42,17 +42,34 @@ _CONSTANT = object()
 class Slot:
     """One cell that may exist, with its encoding of last time."""
 
-    __slots__ = ("_cell", "_device", "_kept", "_row", "_seen", "_varbind", "name", "object", "oid")
+    __slots__ = (
+        "_cell",
+        "_device",
+        "_kept",
+        "_row",
+        "_seen",
+        "_tag",
+        "_varbind",
+        "_wraps",
+        "name",
+        "object",
+        "oid",
+        "watched",
+    )
 
     def __init__(self, oid: Oid, described: ObjectType, row: Row) -> None:
         self.oid = oid
         self.name = wire.object_identifier(oid)
         self.object = described
+        self._tag = wire.TAGS[described.syntax]
+        self._wraps = described.syntax in wire.WRAPPING
         self._row = row
         device: Device | None = getattr(row, "device", None)
         self._device = device if described.changes is Changes.WITH_SNAPSHOT else None
         self._kept = described.changes is Changes.NEVER
         self._seen: object = _NEVER_ENCODED
+        # What the cell depends on: a device's snapshot, nothing, or (None) what cannot be watched.
+        self.watched: object = _CONSTANT if self._kept else self._device
         self._cell: CellValue = None
         self._varbind: bytes | None = None
 
@@ -75,7 +92,9 @@ class Slot:
         if cell == self._cell:
             return
         self._cell = cell
-        self._varbind = None if cell is None else wire.varbind(self.name, wire.value(self.object.syntax, cell))
+        self._varbind = (
+            None if cell is None else wire.varbind(self.name, wire.tagged(self._tag, cell, wraps=self._wraps))
+        )
 
 
 class Window:

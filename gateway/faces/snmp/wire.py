@@ -41,10 +41,15 @@ _SHORT = [[bytes((tag, size)) for size in range(0x80)] for tag in range(0x100)]
 def tlv(tag: int, content: bytes) -> bytes:
     """One value with its identifier and definite length."""
     size = len(content)
+    return _SHORT[tag][size] + content if size < 0x80 else head(tag, size) + content
+
+
+def head(tag: int, size: int) -> bytes:
+    """What stands before a content of so many octets."""
     if size < 0x80:
-        return _SHORT[tag][size] + content
+        return _SHORT[tag][size]
     length = size.to_bytes((size.bit_length() + 7) // 8, "big")
-    return bytes((tag, 0x80 | len(length))) + length + content
+    return bytes((tag, 0x80 | len(length))) + length
 
 
 def integer(tag: int, value: int) -> bytes:
@@ -67,9 +72,13 @@ def object_identifier(oid: Oid) -> bytes:
 
 def value(syntax: Syntax, cell: CellValue) -> bytes:
     """A cell that has a value."""
-    tag = TAGS[syntax]
+    return tagged(TAGS[syntax], cell, wraps=syntax in WRAPPING)
+
+
+def tagged(tag: int, cell: CellValue, *, wraps: bool) -> bytes:
+    """A cell that has a value, of a syntax with this identifier octet."""
     if isinstance(cell, int):
-        return integer(tag, cell & 0xFFFFFFFF if syntax in WRAPPING else cell)
+        return integer(tag, cell & 0xFFFFFFFF if wraps else cell)
     if isinstance(cell, bytes):
         return tlv(tag, cell)
     assert cell is not None
@@ -86,11 +95,11 @@ def counter(oid: Oid, count: int) -> bytes:
     return varbind(object_identifier(oid), integer(0x41, count & 0xFFFFFFFF))
 
 
-def response(request_id: bytes, status: int, index: int, varbinds: bytes) -> bytes:
-    """A Response PDU; `request_id` is an encoded INTEGER, `varbinds` are encoded VarBinds one after the other."""
+def result(status: int, index: int, varbinds: bytes) -> bytes:
+    """What follows the request id in a Response; `varbinds` are encoded VarBinds one after the other."""
     if status == 0:
-        return tlv(RESPONSE, request_id + _NO_ERROR + tlv(0x30, varbinds))
-    return tlv(RESPONSE, request_id + integer(0x02, status) + integer(0x02, index) + tlv(0x30, varbinds))
+        return _NO_ERROR + tlv(0x30, varbinds)
+    return integer(0x02, status) + integer(0x02, index) + tlv(0x30, varbinds)
 
 
 _NO_ERROR = b"\x02\x01\x00\x02\x01\x00"

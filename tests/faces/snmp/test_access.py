@@ -58,7 +58,7 @@ def test_what_is_kept_of_addresses_is_bounded() -> None:
     made = access(Community("public", (ip_network("0.0.0.0/0"),)))
     for number in range(3 * SOURCES_KEPT):
         made.source(f"10.1.{number // 256}.{number % 256}")
-    assert len(made._known) == SOURCES_KEPT
+    assert len(made.known) == SOURCES_KEPT
 
 
 def test_an_allowance_is_used_up_and_comes_back_with_time() -> None:

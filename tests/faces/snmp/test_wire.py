@@ -63,7 +63,7 @@ def test_a_response_is_what_pysnmp_reads_back(
         wire.varbind(wire.object_identifier(oid), wire.value(Syntax.GAUGE32, number)) for oid, number in cells
     )
 
-    pdu = wire.response(wire.integer(0x02, request_id), 0, 0, varbinds)
+    pdu = wire.tlv(wire.RESPONSE, wire.integer(0x02, request_id) + wire.result(0, 0, varbinds))
 
     whole = wire.tlv(0x30, wire.integer(0x02, 1) + wire.tlv(0x04, community) + pdu)
     message, rest = decoder.decode(whole, asn1Spec=rfc1901.Message())

@@ -1,0 +1,388 @@
+"""SNMP reads of 200 devices × 80 columns: the gateway against net-snmp's snmpd with a table in C, one table a question.
+
+    .venv/bin/python -m tests.bench.bench_snmp [--rounds 3] [--seconds 1] [--sockets 8]
+
+The servers run one after the other in every round, on one core (the others are stopped meanwhile), the load generator
+(snmp_load.c) on another; ratios are taken within a round and their median is shown. Requests are made here before a
+run, so the generator only sends them: GET of every cell, GETNEXT of every cell, GETBULK from every 50th cell, which
+together is a walk. SNMPv3 is authPriv with SHA-256 and AES-128. One reply a run is read and checked whole here.
+
+Then Modbus TCP's latency, alone and while the table is walked without a pause.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Self
+
+from gateway.faces.snmp import reader, v3, wire
+from gateway.faces.snmp.layout import shipped_layout
+from gateway.faces.snmp.objects import RowKind
+from gateway.faces.snmp.settings import Oid
+from gateway.faces.snmp.usm import LocalUser
+from tests.bench.bench_modbus_tcp import HERE, compiled, cpu_s, free_port, say, where
+from tests.bench.snmp_server import BENCH, UNITS
+
+COLUMNS = 80
+REPETITIONS = 50
+START_S = 15.0
+REFERENCE = "snmpd"
+CONFIGURATION = """
+agentAddress udp:127.0.0.1:{port}
+rocommunity public 127.0.0.1
+dontLogTCPWrappersConnects yes
+rouser bench authpriv
+dlmod snmp_table {table}
+"""
+SECRET_CONFIGURATION = "createUser bench SHA-256 authpass123 AES privpass123\n"
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked, over which version."""
+
+    name: str
+    version: int
+    kind: int
+
+    def pdu(self, number: int, name: bytes) -> bytes:
+        """One request."""
+        counts = (0, REPETITIONS) if self.kind == reader.GET_BULK else (0, 0)
+        head = wire.integer(0x02, number) + wire.integer(0x02, counts[0]) + wire.integer(0x02, counts[1])
+        return wire.tlv(self.kind, head + wire.tlv(0x30, wire.varbind(name, b"\x05\x00")))
+
+
+QUESTIONS = (
+    Question("v2c GET", 1, reader.GET),
+    Question("v2c GETNEXT", 1, reader.GET_NEXT),
+    Question(f"v2c GETBULK-{REPETITIONS}", 1, reader.GET_BULK),
+    Question("v3 GET", 3, reader.GET),
+    Question(f"v3 GETBULK-{REPETITIONS}", 3, reader.GET_BULK),
+)
+
+
+@dataclass(frozen=True)
+class Server:
+    """A running agent and the cells it has."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    port: int
+    modbus_port: int
+    cells: tuple[Oid, ...]
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one server did in one round."""
+
+    rate: float
+    cells: float  # varbinds a second
+    cpu_us: float
+    p50_us: int
+    p99_us: int
+    lost: int
+    wrong: int
+
+
+class Asker:
+    """A poller: exchanges one datagram, and signs in as SNMPv3 asks for it."""
+
+    def __init__(self, port: int) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.connect(("127.0.0.1", port))
+        self._socket.settimeout(1)
+        self.user: LocalUser | None = None
+        self.authority = v3.Authority(b"", 0, 0)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+    def exchange(self, data: bytes) -> bytes:
+        """The reply to a datagram; TimeoutError without one."""
+        self._socket.send(data)
+        return self._socket.recv(4096)
+
+    def sign_in(self) -> None:
+        """Learn engine id, boots and time: RFC 3414 §4."""
+        pdu = wire.tlv(reader.GET, wire.integer(0x02, 0) * 3 + wire.tlv(0x30, b""))
+        found = self._message(self.exchange(self.sealed(None, v3.REPORTABLE, pdu)))
+        self.user = LocalUser(BENCH, found.engine_id)
+        self.authority = v3.Authority(found.engine_id, 0, 0)
+        found = self._message(self.exchange(self.sealed(self.user, 7, pdu)))  # notInTimeWindow tells the time
+        self.authority = v3.Authority(found.engine_id, found.boots, found.time)
+
+    def sealed(self, user: LocalUser | None, flags: int, pdu: bytes, number: int = 1) -> bytes:
+        """An SNMPv3 message around a PDU."""
+        scoped = v3.scoped(self.authority.engine_id, b"", pdu)
+        return v3.seal(user, self.authority, wire.integer(0x02, number), flags, scoped)
+
+    def request(self, question: Question, number: int, name: bytes) -> bytes:
+        """A whole request message."""
+        pdu = question.pdu(number, name)
+        if question.version == reader.VERSION_3:
+            return self.sealed(self.user, 7, pdu, number)
+        return wire.tlv(0x30, wire.integer(0x02, question.version) + wire.tlv(0x04, b"public") + pdu)
+
+    def varbinds(self, reply: bytes) -> int:
+        """How many varbinds an authentic and errorless reply has."""
+        version, _, at = reader.version(reply)
+        if version == reader.VERSION_3:
+            message = self._message(reply)
+            assert self.user is not None
+            size = self.user.mac.size
+            blank = reply[: message.mac_at] + bytes(size) + reply[message.mac_at + size :]
+            assert self.user.mac.of(blank) == message.mac
+            first, end = reader.content(reply, message.body_at, len(reply), 0x04)
+            vector = v3.vector(message.boots, message.time, message.salt)
+            reply = self.user.cfb.decrypt(vector, reply[first:end])
+            at = v3.scope(reply, 0).pdu_at
+        else:
+            at = reader.community(reply, at)[1]
+        end = len(reply)
+        at, _ = reader.content(reply, at, end, wire.RESPONSE)
+        _, at = reader.integer(reply, at, end)
+        status, at = reader.integer(reply, at, end)
+        _, at = reader.integer(reply, at, end)
+        at, _ = reader.content(reply, at, end, 0x30)
+        assert status == 0, f"error-status {status}"
+        count = 0
+        while at < end:
+            _, at = reader.content(reply, at, end, 0x30)
+            count += 1
+        return count
+
+    @staticmethod
+    def _message(data: bytes) -> v3.Message:
+        return v3.parse(data, reader.version(data)[2])
+
+
+def gateway_cells() -> tuple[Oid, ...]:
+    """The first 80 columns of points, 200 rows, in order."""
+    columns = [
+        (*table.base, 1, column.number)
+        for table in shipped_layout().tables
+        for column in table.columns
+        if table.rows is RowKind.DEVICE and column.point is not None
+    ]
+    return tuple((*column, unit) for column in sorted(columns)[:COLUMNS] for unit in range(1, UNITS + 1))
+
+
+def snmpd_cells() -> tuple[Oid, ...]:
+    """The table of snmp_table.c."""
+    return tuple(
+        (1, 3, 6, 1, 4, 1, 32473, 99, 1, 1, column, row)
+        for column in range(1, COLUMNS + 1)
+        for row in range(1, UNITS + 1)
+    )
+
+
+def started(name: str, folder: Path, core: int) -> Server:
+    """Start one server on a core; returns when it answers."""
+    port, modbus_port = free_port(), free_port()
+    environment = dict(os.environ)
+    if name == REFERENCE:
+        table = folder / "snmp_table.so"
+        flags = subprocess.run(["net-snmp-config", "--base-cflags"], check=True, capture_output=True, text=True)
+        build = ["gcc", "-O2", "-Wall", "-fPIC", "-shared", "-o", str(table), str(HERE / "snmp_table.c")]
+        subprocess.run([*build, *flags.stdout.split()], check=True)
+        configuration = folder / "snmpd.conf"
+        configuration.write_text(CONFIGURATION.format(port=port, table=table) + SECRET_CONFIGURATION)
+        environment.update(SNMP_PERSISTENT_DIR=str(folder), SNMPCONFPATH=str(folder), MIBS="")
+        command = ["/usr/sbin/snmpd", "-f", "-Lf", "/dev/null", "-C", "-c", str(configuration)]
+        cells = snmpd_cells()
+    else:
+        loop = name.rpartition(" ")[2]
+        command = [sys.executable, "-m", "tests.bench.snmp_server", str(port), str(modbus_port), loop]
+        cells = gateway_cells()
+    process = subprocess.Popen(["taskset", "-c", str(core), *command], env=environment, cwd=HERE.parents[1])
+    server = Server(name, process, port, modbus_port, cells)
+    until = time.monotonic() + START_S
+    with Asker(port) as asker:
+        while True:
+            try:
+                asker.exchange(asker.request(QUESTIONS[0], 1, wire.object_identifier(cells[0])))
+            except OSError:
+                if process.poll() is not None or time.monotonic() > until:
+                    process.kill()
+                    raise
+                time.sleep(0.1)
+            else:
+                return server
+
+
+@contextlib.contextmanager
+def awake(server: Server) -> Iterator[None]:
+    """Let a stopped server run."""
+    os.kill(server.process.pid, signal.SIGCONT)
+    try:
+        yield
+    finally:
+        os.kill(server.process.pid, signal.SIGSTOP)
+
+
+def requests(question: Question, server: Server, path: Path) -> None:
+    """Write the requests of a whole walk to `path`, and check one reply."""
+    step = REPETITIONS if question.kind == reader.GET_BULK else 1
+    with Asker(server.port) as asker:
+        if question.version == reader.VERSION_3:
+            asker.sign_in()
+        names = [wire.object_identifier(cell) for cell in server.cells[::step]]
+        made = [asker.request(question, number, name) for number, name in enumerate(names, 0x01010101)]
+        found = asker.varbinds(asker.exchange(made[len(made) // 2]))
+    assert found == (1 if step == 1 else found) and found >= step * 0.6, f"{found} varbinds"  # noqa: PT018
+    path.write_bytes(b"".join(len(each).to_bytes(2) + each for each in made))
+
+
+def measure(generator: Sequence[str], question: Question, server: Server, path: Path) -> Run:
+    """One run of the load generator."""
+    requests(question, server, path)
+    sockets, seconds = generator[-2:]
+    command = [*generator[:-2], str(server.port), sockets]
+    subprocess.run([*command, "0.2", str(path)], check=True, stdout=subprocess.DEVNULL)  # warm up
+    before = cpu_s(server.process.pid)
+    done = subprocess.run([*command, seconds, str(path)], check=True, capture_output=True, text=True)
+    used = cpu_s(server.process.pid) - before
+    result = json.loads(done.stdout)
+    replies = max(1, result["replies"])
+    return Run(
+        rate=result["replies"] / result["seconds"],
+        cells=result["varbinds"] / result["seconds"],
+        cpu_us=used / replies * 1e6,
+        p50_us=result["p50_us"],
+        p99_us=result["p99_us"],
+        lost=result["lost"],
+        wrong=result["wrong"],
+    )
+
+
+def table(runs: dict[str, list[Run]]) -> str:
+    """Medians over the rounds; ratios are medians of the ratios within a round."""
+    reference = runs.get(REFERENCE)
+    head = ["server", "replies/s", f"× {REFERENCE}", "CPU µs a reply", f"÷ {REFERENCE}", "p50 µs", "p99 µs"]
+    head += ["lost", "wrong"]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for name, own in runs.items():
+        pairs = list(zip(own, reference, strict=True)) if reference else []
+        cells = [
+            name,
+            f"{statistics.median(run.rate for run in own):,.0f}",
+            f"{statistics.median(a.rate / b.rate for a, b in pairs):.2f}" if pairs else "–",
+            f"{statistics.median(run.cpu_us for run in own):.1f}",
+            f"{statistics.median(a.cpu_us / b.cpu_us for a, b in pairs):.2f}" if pairs else "–",
+            f"{statistics.median(run.p50_us for run in own):,.0f}",
+            f"{statistics.median(run.p99_us for run in own):,.0f}",
+            str(sum(run.lost for run in own)),
+            str(sum(run.wrong for run in own)),
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def beside_modbus(server: Server, folder: Path, rounds: int, seconds: float, core: int) -> str:
+    """Modbus TCP latency of a server without and with a walk that never pauses: 16 clients, one request each."""
+    load = compiled("modbus_load.c", folder)
+    walk = folder / "walk"
+    requests(QUESTIONS[2], server, walk)
+    pin = ["taskset", "-c", str(core)]
+    modbus = [*pin, load, str(server.modbus_port), "16", "1", str(seconds), "8"]
+    found: dict[str, list[dict[str, float]]] = {"alone": [], "during a walk": []}
+    for _ in range(rounds):
+        for name, results in found.items():
+            walker = None
+            if name != "alone":
+                command = [*pin, str(folder / "snmp_load"), str(server.port), "1", str(seconds + 1), str(walk)]
+                walker = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+                time.sleep(0.3)
+            done = subprocess.run(modbus, check=True, capture_output=True, text=True)
+            result = json.loads(done.stdout)
+            if walker is not None:
+                output, _ = walker.communicate()
+                walked = json.loads(output)
+                result["cells"] = walked["varbinds"] / walked["seconds"]
+            results.append(result)
+    lines = ["| Modbus TCP | replies/s | p50 µs | p99 µs | lost | cells/s walked |", "|" + "---|" * 6]
+    for name, results in found.items():
+        rate = statistics.median(each["replies"] / each["seconds"] for each in results)
+        p50, p99 = (statistics.median(each[key] for each in results) for key in ("p50_us", "p99_us"))
+        cells = statistics.median(each.get("cells", 0) for each in results)
+        lost = sum(each["lost"] for each in results)
+        lines.append(f"| {name} | {rate:,.0f} | {p50:,.0f} | {p99:,.0f} | {lost:.0f} | {cells:,.0f} |")
+    pairs = zip(found["alone"], found["during a walk"], strict=True)
+    ratio = statistics.median(walked["p99_us"] / alone["p99_us"] for alone, walked in pairs)
+    return "\n".join(lines) + f"\n\np99 during a walk ÷ alone: {ratio:.2f}"
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=1.0)
+    parser.add_argument("--sockets", type=int, default=8)
+    parser.add_argument(
+        "--only", nargs="+", metavar="QUESTION", help="ask only what has one of these words in its name"
+    )
+    options = parser.parse_args()
+    for tool in ("gcc", "taskset"):
+        if shutil.which(tool) is None:
+            sys.exit(f"this benchmark needs {tool}")
+    usable = sorted(os.sched_getaffinity(0))
+    names = ["gateway, asyncio"]
+    if find_spec("uvloop"):
+        names.append("gateway, uvloop")
+    if shutil.which("net-snmp-config") and Path("/usr/sbin/snmpd").exists():
+        names.append(REFERENCE)
+    else:
+        say("left out: snmpd (Debian packages snmpd and libsnmp-dev are not installed)")
+    with tempfile.TemporaryDirectory(prefix="bench-") as made, contextlib.ExitStack() as ending:
+        folder = Path(made)
+        compiled("snmp_load.c", folder)
+        generator = ["taskset", "-c", str(usable[-1]), str(folder / "snmp_load")]
+        servers = []
+        for name in names:
+            server = started(name, folder, usable[0])
+            ending.callback(server.process.wait)
+            ending.callback(server.process.kill)
+            os.kill(server.process.pid, signal.SIGSTOP)
+            servers.append(server)
+        command = [*generator, str(options.sockets), str(options.seconds)]
+        say(
+            f"\n{UNITS} devices × {COLUMNS} columns, {options.sockets} askers, {options.rounds} rounds of"
+            f" {options.seconds:g} s a server; {where()}"
+        )
+        wanted = [each for each in QUESTIONS if not options.only or any(word in each.name for word in options.only)]
+        for question in wanted:
+            runs: dict[str, list[Run]] = {name: [] for name in names}
+            for _ in range(options.rounds):
+                for server in servers:
+                    with awake(server):
+                        runs[server.name].append(measure(command, question, server, folder / "requests"))
+            say(f"\n{question.name}\n\n{table(runs)}")
+        if options.only:
+            return
+        own = servers[len(servers) - 1 - (REFERENCE in names)]
+        with awake(own):
+            say(f"\nModbus TCP beside it ({own.name}), 16 clients\n")
+            say(beside_modbus(own, folder, options.rounds, options.seconds, usable[-1]))
+
+
+if __name__ == "__main__":
+    main()

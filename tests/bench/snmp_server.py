@@ -1,0 +1,90 @@
+"""The SNMP face over memory, with the Modbus TCP face beside it: `snmp_server.py PORT MODBUS_PORT asyncio|uvloop`.
+
+200 devices, every point with a value, snapshots replaced every second as polls do. The community is "public"; the
+user "bench" has SHA-256 and AES-128. The allowance of a source is out of the way; everything else is on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from dataclasses import replace
+from ipaddress import ip_network
+
+from gateway.clock import SystemClock
+from gateway.core.site import Device, Site
+from gateway.core.snapshot import Block, DeviceState, Snapshot
+from gateway.core.stats import ModbusServerStats
+from gateway.devices.model import DeviceMap, Space, Value
+from gateway.devices.schema import load_map
+from gateway.faces.modbus.server import ModbusServer
+from gateway.faces.modbus.settings import ModbusSettings
+from gateway.faces.snmp.agent import SnmpAgent
+from gateway.faces.snmp.secret import Secret
+from gateway.faces.snmp.settings import Community, SnmpSettings, User
+from gateway.faces.snmp.usm import Auth, Credentials, Priv
+from tests.bench.gateway_server import NoLine
+
+UNITS = 200
+POLL_S = 1.0
+LOOPBACK = (ip_network("127.0.0.0/8"),)
+BENCH = Credentials(b"bench", Auth.SHA_256, Secret(b"authpass123"), Priv.AES_128, Secret(b"privpass123"))
+
+
+def values(device_map: DeviceMap, number: int) -> dict[str, Value]:
+    """A value for every point, different from poll to poll."""
+    return {
+        point.name: device_map.enumerations[point.enumeration][0].number
+        if point.enumeration
+        else 1
+        if point.bits
+        else 10 + (number + position) % 100 / 8
+        for position, point in enumerate(device_map.points)
+    }
+
+
+async def serve(port: int, modbus_port: int) -> None:
+    clock = SystemClock()
+    line = NoLine()
+    device_map = load_map("prostar-mppt")
+    devices = [Device(f"unit-{unit}", unit, unit, device_map) for unit in range(1, UNITS + 1)]
+    for device in devices:
+        device.line = line
+        device.snapshot = Snapshot(state=DeviceState.ONLINE, last_reply_at=clock.monotonic())
+    site, stats = Site.of("bench", [line], devices), ModbusServerStats()
+    settings = SnmpSettings(
+        listen=(("127.0.0.1", port),),
+        communities=(Community("public", LOOPBACK),),
+        users=(User(BENCH, LOOPBACK),),
+        requests_per_s=1e9,
+    )
+    agent = SnmpAgent(settings, site, clock, stats)
+    modbus = ModbusServer(ModbusSettings(listen=(("127.0.0.1", modbus_port),)), site, clock, stats)
+    number = 0
+    data = b"".join(at.to_bytes(2) for at in range(0x52))
+    await modbus.listeners[0].start()
+    await agent.listeners[0].start()
+    while True:
+        number += 1
+        for device in devices:
+            block = Block(Space.REGISTERS, 0, 0x52, data, clock.monotonic())
+            now = clock.monotonic()
+            found = values(device_map, number + device.unit_id)
+            device.snapshot = replace(
+                device.snapshot,
+                version=number,
+                blocks=(block,),
+                last_reply_at=now,
+                values=found,
+                read_at=dict.fromkeys(found, now),
+            )
+            await asyncio.sleep(POLL_S / UNITS if number > 1 else 0)
+
+
+if __name__ == "__main__":
+    if sys.argv[3] == "uvloop":
+        import uvloop
+
+        uvloop.run(serve(int(sys.argv[1]), int(sys.argv[2])))
+    else:
+        asyncio.run(serve(int(sys.argv[1]), int(sys.argv[2])))

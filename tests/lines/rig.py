@@ -1,0 +1,72 @@
+"""What the tests of a running line share."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+from gateway.clock import SystemClock
+from gateway.core.settings import LineSettings
+from gateway.core.site import Device, Outcome
+from gateway.lines.serial import SerialLine
+from gateway.modbus.pdu import Function, ReadRequest
+
+
+@contextlib.asynccontextmanager
+async def running(line: SerialLine) -> AsyncIterator[SerialLine]:
+    task = asyncio.create_task(line.run())
+    try:
+        yield line
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+def make_line(port: Path | str, device: Device, **settings: object) -> SerialLine:
+    line_settings = LineSettings(name="shelter-a", index=1, port=str(port), reply_timeout_s=0.1, **settings)  # type: ignore[arg-type]  # the tests' own calls
+    return SerialLine(line_settings, [device], SystemClock())
+
+
+async def until(condition: Callable[[], bool], limit_s: float = 10.0) -> None:
+    """Wait for a state that only the outside world brings about."""
+    async with asyncio.timeout(limit_s):
+        while not condition():  # noqa: ASYNC110  # the snapshot is replaced without an event
+            await asyncio.sleep(0.01)
+
+
+async def ask(line: SerialLine, device: Device, address: int, count: int = 1) -> Outcome:
+    done: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
+    line.read(device, ReadRequest(Function.READ_HOLDING_REGISTERS, address, count).encode(), done.set_result)
+    async with asyncio.timeout(5):
+        return await done
+
+
+class LoopLag:
+    """The longest time in which the loop did nothing else, in seconds."""
+
+    def __init__(self) -> None:
+        self.worst_s = 0.0
+
+    async def measure(self) -> None:
+        """Run beside what is measured until cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            asked = loop.time()
+            await asyncio.sleep(0.005)
+            self.worst_s = max(self.worst_s, loop.time() - asked - 0.005)
+
+
+@contextlib.asynccontextmanager
+async def lag_meter() -> AsyncIterator[LoopLag]:
+    """Measures for the time of the block."""
+    lag = LoopLag()
+    task = asyncio.create_task(lag.measure())
+    try:
+        yield lag
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
