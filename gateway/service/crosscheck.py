@@ -32,13 +32,13 @@ def cross_problems(raw: Raw) -> list[Problem]:
         problems += _upstream((*path, "port"), line.get("port"))
     for path, device in devices:
         problems += _model(path, device)
+    problems += _pair(raw, "http", "tls_certificate", "tls_private_key")
     snmp = _table(raw, "snmp")
     communities = _tables(snmp, "community", ("snmp",))
     problems += _repeated((((*path, "name"), table.get("name")) for path, table in communities), secret=True)
     problems += _line_listeners(raw, [line.get("name") for _, line in lines])
     problems += _listen_clashes(raw, ("modbus", "http"))
     problems += _listen_clashes(raw, ("snmp",))
-    problems += _pair(raw, "http", "tls_certificate", "tls_private_key")
     if _table(raw, "modbus").get("writes") is True:
         problems.append(Problem(("modbus", "writes"), f"writing to controllers is {NOT_SUPPORTED}; allowed: false"))
     return problems
