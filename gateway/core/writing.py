@@ -238,7 +238,8 @@ class SlaveControl:
             old = _word(job.device, part.write)
             moment, fate = yield from _send(job.device, part, moment)
             results.append(PartResult(part, old, fate, _label(moment.outcome)))
-            left_out = self._worth_noting((job.device.unit_id, part.write.space, part.write.address), part, moment)
+            cell = (job.device.unit_id, part.write.space, part.write.address)
+            left_out = None if fate is Fate.NOT_SENT else self._worth_noting(cell, part, moment)
             if left_out is not None:
                 intent = _intent(job, part, at, wall=moment.wall, old=old, left_out=left_out)
                 yield Note((intent, Verdict(intent.id, moment.wall, fate, _code(moment.outcome))))

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from gateway.core.budget import LineBudget
 from gateway.service.schema import DOCUMENTATION_ROOT, Config, LineTable, parse_listen, parse_root
+from gateway.service.writes import write_advice
 
 SATURATED = 0.95
 GUESSED_COMMUNITIES = ("public", "private")
@@ -68,6 +69,7 @@ def _modbus(config: Config) -> Iterator[str]:
         yield "modbus.allow: only this machine may connect, so listening on other addresses is of no use"
     if config.modbus.listen and not config.modbus.allow:
         yield "modbus.allow: is empty, so nobody may connect"
+    yield from write_advice(config)
 
 
 def _snmp(config: Config) -> Iterator[str]:

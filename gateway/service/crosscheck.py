@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from gateway.devices.schema import load_map, models
 from gateway.service.problems import Path, Problem, render_path, show, table_at
 from gateway.service.schema import NOT_SUPPORTED, Address, parse_listen
+from gateway.service.writes import rule_problems
 
 Raw = Mapping[str, object]
 
@@ -39,9 +40,8 @@ def cross_problems(raw: Raw) -> list[Problem]:
     problems += _line_listeners(raw, [line.get("name") for _, line in lines])
     problems += _listen_clashes(raw, ("modbus", "http"))
     problems += _listen_clashes(raw, ("snmp",))
-    if _table(raw, "modbus").get("writes") is True:
-        problems.append(Problem(("modbus", "writes"), f"writing to controllers is {NOT_SUPPORTED}; allowed: false"))
-    return problems
+    rules = list(_tables(_table(raw, "modbus"), "write", ("modbus",)))
+    return [*problems, *rule_problems(rules, [device for _, device in devices])]
 
 
 def _table(raw: Raw, name: str) -> Raw:

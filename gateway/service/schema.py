@@ -18,6 +18,7 @@ from urllib.parse import urlsplit
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from gateway.core.settings import LineSettings, PollSettings
+from gateway.core.write_wear import WearLimits
 
 MORNINGSTAR_ROOT = (1, 3, 6, 1, 4, 1, 33333)
 DOCUMENTATION_ROOT = (1, 3, 6, 1, 4, 1, 32473)
@@ -68,6 +69,18 @@ def parse_listen(text: str) -> Address:
     return Address(str(ip), int(port))
 
 
+def parse_range(text: str) -> tuple[int, int]:
+    """First and last address of `0xE000-0xE005` or `0x0001`; ValueError for anything else."""
+    found = re.fullmatch(r"0x([0-9A-Fa-f]{1,4})(?:-0x([0-9A-Fa-f]{1,4}))?", text)
+    if found is None:
+        raise ValueError("no range of addresses")
+    first = int(found[1], 16)
+    last = first if found[2] is None else int(found[2], 16)
+    if last < first:
+        raise ValueError("the last address is before the first")
+    return first, last
+
+
 def parse_root(text: str) -> tuple[int, ...]:
     """The numbers of a dotted OID below 1.3.6.1.4.1; ValueError otherwise."""
     if not re.fullmatch(r"1\.3\.6\.1\.4\.1(\.(0|[1-9][0-9]{0,9})){1,20}", text):
@@ -86,6 +99,11 @@ def _listen(text: str) -> str:
 
 def _network(text: str) -> str:
     return str(ipaddress.ip_network(text))
+
+
+def _range(text: str) -> str:
+    parse_range(text)
+    return text
 
 
 def _root(text: str) -> str:
@@ -115,15 +133,21 @@ Hours = Annotated[float, Field(allow_inf_nan=False)]
 Listens = Annotated[tuple[Listen, ...], Field(strict=False)]
 AbsolutePath = Annotated[str, Field(pattern=r"^(/[^\x00-\x1f]*)?$")]
 Networks = Annotated[tuple[Network, ...], Field(strict=False)]
+Ranges = Annotated[tuple[Annotated[str, AfterValidator(_range)], ...], Field(strict=False)]
 
 _NAME = "1 to 64 printable characters, no blank at either end"
 _TEXT = "up to 255 printable ASCII characters"
 _LISTEN = 'a list of "IPv4:port" or "[IPv6]:port" such as "127.0.0.1:1502"; [] turns the face off'
 _NETWORK = 'a list of addresses or networks such as "127.0.0.0/8", "10.1.2.3" or "::1/128"'
+<<<<<<< HEAD
 _FILE = 'the absolute path of a file, or "" for none'
+=======
+_RANGES = 'a list of PDU addresses or ranges of them such as "0xE000-0xE005" or "0x0001"'
+>>>>>>> main
 _LOOPBACK = ("127.0.0.0/8", "::1/128")
 _LINE = LineSettings(name="", index=1, port="")
 _POLL = PollSettings()
+_WEAR = WearLimits()
 
 
 class Table(BaseModel):
@@ -257,6 +281,25 @@ class ListenerTable(Table):
     line: Annotated[Name, Key("the name of a line", "The line that it stands for; each line has one listener at most.")]
 
 
+class WriteTable(Table):
+    """`[[modbus.write]]`: who may write what; a request is allowed when rules allow all of it."""
+
+    source: Annotated[Networks, Key(_NETWORK + ", at least one", "Who may write.")] = Field(min_length=1)
+    unit_id: Annotated[
+        Annotated[tuple[Annotated[int, Field(ge=1, le=247)], ...], Field(strict=False)],
+        Key("a list of unit ids of the file", "On which controllers; left out: on all."),
+    ] = ()
+    point: Annotated[
+        Annotated[tuple[Name, ...], Field(strict=False)],
+        Key("a list of points of the map that can be written", "What may be written, by name."),
+    ] = ()
+    registers: Annotated[
+        Ranges,
+        Key(_RANGES, "Further registers, without those that must be named."),
+    ] = ()
+    coils: Annotated[Ranges, Key(_RANGES, "Further coils, without those that must be named.")] = ()
+
+
 class ModbusTable(Table):
     """`[modbus]`: the Modbus TCP face."""
 
@@ -270,7 +313,28 @@ class ModbusTable(Table):
         bool,
         Key("true or false", "Answer 02 for ranges outside of the map without asking the controller."),
     ] = False
-    writes: Annotated[bool, Key("false", "Writing to controllers; this version refuses every write.")] = False
+    writes: Annotated[
+        bool,
+        Key(
+            "true or false",
+            "Writing to controllers, as far as [[modbus.write]] allows it; each write is noted in `state_dir` first.",
+        ),
+    ] = False
+    eeprom_writes_per_day: Annotated[
+        int,
+        Key("1 to 1000", "How often a register that wears may be written within 24 hours; after that 06."),
+    ] = Field(default=_WEAR.per_day, ge=1, le=1000)
+    write_interval_s: Annotated[
+        Seconds,
+        Key(
+            "0.0 to 3600.0",
+            "How soon a register or coil may be written again; before that 06. Slave control is free of it.",
+        ),
+    ] = Field(default=_WEAR.interval_s, ge=0.0, le=3600.0)
+    write: Annotated[
+        Annotated[tuple[WriteTable, ...], Field(strict=False)],
+        Key("[[modbus.write]] tables", "Who may write what; without one nobody can."),
+    ] = ()
     listener: Annotated[
         Annotated[tuple[ListenerTable, ...], Field(strict=False)],
         Key(
@@ -352,7 +416,7 @@ class Config(Table):
     site: Annotated[Name, Key(_NAME, "The site's name, shown on every face.")]
     state_dir: Annotated[
         Annotated[str, Field(pattern=r"^/")],
-        Key("an absolute path", "Where later versions keep state; this version writes nothing."),
+        Key("an absolute path", "Where the gateway keeps what must outlive it, such as the write ledger."),
     ] = "/var/lib/prostar-gateway"
     line: Annotated[
         Annotated[tuple[LineTable, ...], Field(strict=False)],

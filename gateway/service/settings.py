@@ -15,6 +15,7 @@ from gateway.faces.modbus.settings import LineListen, ModbusSettings
 from gateway.faces.snmp.settings import Community, SnmpSettings
 from gateway.history.settings import HistorySettings
 from gateway.service.schema import Config, LineTable, parse_listen, parse_root
+from gateway.service.writes import line_writes, write_rules, write_settings
 
 Pairs = tuple[tuple[str, int], ...]
 
@@ -24,6 +25,7 @@ STOP_GRACE_S = 1.0
 
 def line_settings(config: Config) -> tuple[LineSettings, ...]:
     """The settings of every line, in the order of the file."""
+    rules = write_rules(config)
     poll = PollSettings(config.poll.live_s, config.poll.settings_s, config.poll.night_s)
     return tuple(
         LineSettings(
@@ -40,6 +42,7 @@ def line_settings(config: Config) -> tuple[LineSettings, ...]:
             gap_s=line.gap_s,
             queue_limit=line.queue_limit,
             queue_limit_s=line.queue_limit_s,
+            writes=line_writes(rules, line_devices(line)),
             poll=poll,
         )
         for number, line in enumerate(config.line, start=1)
@@ -84,6 +87,7 @@ def modbus_settings(config: Config) -> ModbusSettings:
         max_connections=modbus.max_connections,
         allow=tuple(ipaddress.ip_network(network) for network in modbus.allow),
         max_age_s=config.cache.max_age_s,
+        writes=write_settings(config),
         strict_map=modbus.strict_map,
         reply_timeout_s=deadline_s - WATCH_S,
         stop_grace_s=STOP_GRACE_S,

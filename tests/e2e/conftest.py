@@ -34,13 +34,14 @@ def launch(tmp_path: Path, start: Start, free_tcp_port: Callable[[], int], free_
         devices: Sequence[tuple[str, str, int, int]] = DEMO_DEVICES,
         line_keys: str = "",
         rest: str = "",
+        modbus_keys: str = "",
     ) -> Running:
         simulator = None
         if simulate is not None:
             simulator = start(*GATEWAY, "simulate", "--link-dir", str(tmp_path), *simulate)
             wait_until(lambda: any(path.is_symlink() for path in tmp_path.iterdir()), "the simulated lines")
         ports = (free_tcp_port(), free_udp_port(), free_tcp_port())
-        write_config(tmp_path / "site.toml", ports, devices, line_keys, rest)
+        write_config(tmp_path / "site.toml", ports, devices, line_keys, rest, modbus_keys=modbus_keys)
         gateway = start(*GATEWAY, "run", "-c", str(tmp_path / "site.toml"))
         return Running(tmp_path, *ports, gateway, simulator)
 

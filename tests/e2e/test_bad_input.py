@@ -42,7 +42,7 @@ def ask(port: int, unit: int, *, tid: int = 7) -> bytes:
 
 def test_a_bad_config_exits_78_with_every_problem(tmp_path: Path) -> None:
     path = tmp_path / "site.toml"
-    path.write_text('sight = "a"\n[[line]]\nname = "a"\n[poll]\nlive_s = 0\n[modbus]\nwrites = true\n')
+    path.write_text('sight = "a"\n[[line]]\nname = "a"\n[poll]\nlive_s = 0\n[modbus]\nwrites = 1\n')
     for command in ("run", "check-config"):
         done = subprocess.run([*GATEWAY, command, "-c", str(path)], capture_output=True, text=True, check=False)
         assert done.returncode == 78

@@ -29,6 +29,8 @@ unit_id = 11
 model = "prostar-mppt"
 """
 
+WRITE = '[[modbus.write]]\nsource = ["127.0.0.1"]\n'
+
 
 def problems(text: str) -> list[str]:
     """What is wrong with a file, without its name."""
@@ -122,7 +124,7 @@ def test_the_full_example_shows_the_defaults() -> None:
     full, minimal = load_config(CONFIGS / "full.toml"), load_config(CONFIGS / "minimal.toml")
     assert full.poll.model_copy(update={"night_s": None}) == minimal.poll  # TOML cannot show "as by day"
     assert full.cache == minimal.cache
-    assert full.modbus.model_copy(update={"listener": ()}) == minimal.modbus
+    assert full.modbus.model_copy(update={"listener": (), "write": ()}) == minimal.modbus
     assert full.http == minimal.http
     assert full.state_dir == minimal.state_dir
     shown = set(type(full.line[0]).model_fields) - {"name", "port", "device"}
@@ -159,7 +161,7 @@ live_s = true
 [modbus]
 listen = ["localhost:1502", "127.0.0.1:9850"]
 allow = ["10.0.0.1/8"]
-writes = true
+writes = "yes"
 [snmp]
 enterprise_root = "1.3.6.1.4.1.33333.9"
 [[snmp.community]]
@@ -210,7 +212,10 @@ listen = ["127.0.0.1:70000"]
         (MINIMAL + '[cache]\nmax_age_s = "5"\n', 'cache.max_age_s: "5" is not a number; allowed: 0.1 to 3600.0'),
         (MINIMAL + "[cache]\nmax_age_s = 1979-05-27\n", "cache.max_age_s: 1979-05-27 is not a number"),
         (MINIMAL + "[modbus]\nmax_connections = 1.5\n", "modbus.max_connections: 1.5 is not a whole number"),
-        (MINIMAL + "[modbus]\nwrites = 0\n", "modbus.writes: 0 is not true or false; allowed: false"),
+        (MINIMAL + "[modbus]\nwrites = 0\n", "modbus.writes: 0 is not true or false; allowed: true or false"),
+        (MINIMAL + "[[modbus.write]]\n", "modbus.write[0].source: is missing; allowed: a list of addresses"),
+        (MINIMAL + WRITE, "modbus.write[0]: allows nothing; allowed: point, registers or coils"),
+        (MINIMAL + WRITE + "unit_id = [99]\n", "modbus.write[0].unit_id[0]: no device has unit id 99; allowed: 11"),
         (
             MINIMAL + '[http]\ntls_certificate = "/etc/crt"\n',
             "http.tls_private_key: is missing, and http.tls_certificate is there; allowed: both or neither",
@@ -220,9 +225,20 @@ listen = ["127.0.0.1:70000"]
             'http.bearer_token_file: "token" is not allowed; allowed: the absolute path of a file, or "" for none',
         ),
         (
-            MINIMAL + "[modbus]\nwrites = true\n",
-            "modbus.writes: writing to controllers is not supported in this version",
+            MINIMAL + WRITE + 'point = ["battery_voltage"]\n',
+            'modbus.write[0].point[0]: "battery_voltage" can only be r',
         ),
+        (MINIMAL + WRITE + 'point = ["lighting_test"]\n', 'modbus.write[0].point[0]: "lighting_test" can only be read'),
+        (
+            MINIMAL + WRITE + 'point = ["reset"]\n',
+            'modbus.write[0].point[0]: "reset" is no point of these devices; all',
+        ),
+        (MINIMAL + WRITE + 'registers = ["E000"]\n', 'modbus.write[0].registers[0]: "E000" is not allowed; allowed: a'),
+        (MINIMAL + WRITE + 'registers = ["0x2-0x1"]\n', 'modbus.write[0].registers[0]: "0x2-0x1" is not allowed; a'),
+        (MINIMAL + WRITE + 'registers = ["0x0000-0x0024"]\n', "modbus.write[0].registers[0]: "),
+        (MINIMAL + WRITE + 'coils = ["0x00FE-0x00FF"]\n', 'modbus.write[0].coils[0]: "0x00FE-0x00FF" has nothing that'),
+        (MINIMAL + "[modbus]\nwrite_interval_s = -1.0\n", "modbus.write_interval_s: -1.0 is out of range"),
+        (MINIMAL + "[modbus]\neeprom_writes_per_day = 0\n", "modbus.eeprom_writes_per_day: 0 is out of range"),
         (
             MINIMAL + '[modbus]\nlisten = "127.0.0.1:1"\n',
             'modbus.listen: "127.0.0.1:1" is not a list; allowed: a list of',

@@ -22,6 +22,7 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "`[cache]`": schema.CacheTable,
     "`[modbus]`": schema.ModbusTable,
     "`[[modbus.listener]]`": schema.ListenerTable,
+    "`[[modbus.write]]`": schema.WriteTable,
     "`[snmp]`": schema.SnmpTable,
     "`[[snmp.community]]`": schema.CommunityTable,
     "`[http]`": schema.HttpTable,

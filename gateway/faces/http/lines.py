@@ -25,6 +25,8 @@ from gateway.faces.http.rules import (
 
 LINE_LABELS = ("line", "site")
 
+_ECHO = {"present": 1.0, "absent": 0.0}
+
 ERROR_KINDS = ("timeout", "crc", "mismatch", "exception")
 
 
@@ -88,6 +90,10 @@ LINE_RULES: tuple[Rule[LineView], ...] = (
     one(
         _line_gauge("stretch_ratio", "How much longer live values take than was asked for; 1 while the line keeps up."),
         lambda view: view.status.stretch,
+    ),
+    known(
+        _line_gauge("echo", "1 while the line gives our own requests back, 0 while not; absent until that is known."),
+        lambda view: _ECHO.get(view.status.echo),
     ),
     one(_line_gauge("queue_depth", "Reads of clients that wait for the line."), lambda view: view.status.queue_depth),
     one(_line_counter("requests", "Requests sent on the line."), lambda view: view.port.stats.sent),

@@ -82,6 +82,10 @@ MODBUS_RULES: tuple[Rule[ModbusServerStats], ...] = (
         lambda stats: stats.refused,
     ),
     each(
+        gateway_counter("modbus_writes", "Single writes that a rule allowed, by what became of them.", "outcome"),
+        lambda stats: stats.writes,
+    ),
+    each(
         gateway_counter("modbus_connections_closed", "Modbus TCP connections the server ended, by reason.", "reason"),
         lambda stats: stats.closed,
     ),

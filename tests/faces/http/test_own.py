@@ -97,7 +97,7 @@ def test_version_and_start(site: Site, clock: ManualClock) -> None:
 def test_what_is_collected_is_what_is_described(site: Site, clock: ManualClock) -> None:
     modbus = ModbusServerStats()
     modbus.exceptions[2] = 1
-    for reasons in (modbus.malformed, modbus.refused, modbus.closed):
+    for reasons in (modbus.malformed, modbus.refused, modbus.writes, modbus.closed):
         reasons["because"] = 1
     line, device = site.lines[0], site.devices[0]
     line.stats.seconds_by_client["10.0.0.1"] = 1.0
