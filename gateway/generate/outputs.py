@@ -11,12 +11,13 @@ from pathlib import Path
 from gateway.generate.metrics import metric_outputs
 from gateway.generate.mib import mib_outputs
 from gateway.generate.registers import register_outputs
+from gateway.generate.rules import rule_outputs
 
 
 def outputs() -> dict[str, str]:
     """Every derived file: path from the repository's root → text."""
     made: dict[str, str] = {}
-    for part in (mib_outputs(), register_outputs(), metric_outputs()):
+    for part in (mib_outputs(), register_outputs(), metric_outputs(), rule_outputs()):
         for path, text in part.items():
             if path in made:
                 raise ValueError(f"{path} is made twice")

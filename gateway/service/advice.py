@@ -93,8 +93,31 @@ def _snmp(config: Config) -> Iterator[str]:
 
 
 def _http(config: Config) -> Iterator[str]:
-    for path, text in _named("http.listen", _beyond_loopback(config.http.listen)):
-        yield f"{path}: {text} can be reached from other machines, and /metrics has no password"
+    http = config.http
+    secrets = {"basic_auth_file": http.basic_auth_file, "bearer_token_file": http.bearer_token_file}
+    for path, text in _named("http.listen", _beyond_loopback(http.listen)):
+        if not any(secrets.values()):
+            yield f"{path}: {text} can be reached from other machines, and /metrics has no password"
+        elif not http.tls_certificate:
+            yield f"{path}: {text} can be reached from other machines, and without TLS the secret is sent in clear"
+    for key, name in {**secrets, "tls_private_key": http.tls_private_key}.items():
+        if name:
+            yield from _secret_file(f"http.{key}", Path(name))
+    if http.tls_certificate:
+        yield from _readable("http.tls_certificate", Path(http.tls_certificate))
+
+
+def _secret_file(key: str, path: Path) -> Iterator[str]:
+    yield from _readable(key, path)
+    if path.is_file() and path.stat().st_mode & 0o007:
+        yield f"{key}: {path} is open to every user of this machine (mode {path.stat().st_mode & 0o777:03o})"
+
+
+def _readable(key: str, path: Path) -> Iterator[str]:
+    try:
+        path.read_bytes()
+    except OSError as error:
+        yield f"{key}: {path} cannot be read ({error.strerror}); the HTTP face stays closed until it can"
 
 
 def _beyond_loopback(listens: Sequence[str]) -> list[tuple[int, str]]:

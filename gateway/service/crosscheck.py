@@ -33,6 +33,7 @@ def cross_problems(raw: Raw) -> list[Problem]:
         problems += _upstream((*path, "port"), line.get("port"))
     for path, device in devices:
         problems += _model(path, device)
+    problems += _pair(raw, "http", "tls_certificate", "tls_private_key")
     snmp = _table(raw, "snmp")
     communities = _tables(snmp, "community", ("snmp",))
     problems += _repeated((((*path, "name"), table.get("name")) for path, table in communities), secret=True)
@@ -148,6 +149,13 @@ def _listen_clashes(raw: Raw, faces: tuple[str, ...]) -> Iterator[Problem]:
             seen.append((address, path))
         else:
             yield Problem(path, f"{show(text)} clashes with {render_path(other)}; allowed: another address or port")
+
+
+def _pair(raw: Raw, table: str, one: str, other: str) -> Iterator[Problem]:
+    """Two keys of which neither is of use alone."""
+    for key, missing in ((one, other), (other, one)):
+        if _table(raw, table).get(key, "") != "" and _table(raw, table).get(missing, "") == "":
+            yield Problem((table, missing), f"is missing, and {table}.{key} is there; allowed: both or neither")
 
 
 def _address(text: object) -> Address | None:

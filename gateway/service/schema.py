@@ -131,6 +131,7 @@ Network = Annotated[str, AfterValidator(_network)]
 Seconds = Annotated[float, Field(allow_inf_nan=False)]
 Hours = Annotated[float, Field(allow_inf_nan=False)]
 Listens = Annotated[tuple[Listen, ...], Field(strict=False)]
+AbsolutePath = Annotated[str, Field(pattern=r"^(/[^\x00-\x1f]*)?$")]
 Networks = Annotated[tuple[Network, ...], Field(strict=False)]
 Ranges = Annotated[tuple[Annotated[str, AfterValidator(_range)], ...], Field(strict=False)]
 
@@ -138,7 +139,11 @@ _NAME = "1 to 64 printable characters, no blank at either end"
 _TEXT = "up to 255 printable ASCII characters"
 _LISTEN = 'a list of "IPv4:port" or "[IPv6]:port" such as "127.0.0.1:1502"; [] turns the face off'
 _NETWORK = 'a list of addresses or networks such as "127.0.0.0/8", "10.1.2.3" or "::1/128"'
+<<<<<<< HEAD
+_FILE = 'the absolute path of a file, or "" for none'
+=======
 _RANGES = 'a list of PDU addresses or ranges of them such as "0xE000-0xE005" or "0x0001"'
+>>>>>>> main
 _LOOPBACK = ("127.0.0.0/8", "::1/128")
 _LINE = LineSettings(name="", index=1, port="")
 _POLL = PollSettings()
@@ -369,9 +374,24 @@ class SnmpTable(Table):
 
 
 class HttpTable(Table):
-    """`[http]`: /metrics, /healthz and /readyz."""
+    """`[http]`: /metrics, /sd, /healthz and /readyz."""
 
     listen: Annotated[Listens, Key(_LISTEN, "Where Prometheus scrapes and health checks ask.")] = ("127.0.0.1:9850",)
+    basic_auth_file: Annotated[
+        AbsolutePath,
+        Key(_FILE, "Names and passwords of who may ask, one name:password a line; /healthz stays open."),
+    ] = ""
+    bearer_token_file: Annotated[
+        AbsolutePath,
+        Key(_FILE, "A token of 16 printable ASCII characters or more; who shows it may ask."),
+    ] = ""
+    tls_certificate: Annotated[
+        AbsolutePath,
+        Key(_FILE, "The certificate (PEM, with its chain) of HTTPS; needs tls_private_key."),
+    ] = ""
+    tls_private_key: Annotated[AbsolutePath, Key(_FILE, "The certificate's private key (PEM, without a password).")] = (
+        ""
+    )
 
 
 class HistoryTable(Table):

@@ -111,7 +111,15 @@ def snmp_settings(config: Config) -> SnmpSettings:
 
 def http_settings(config: Config) -> HttpSettings:
     """The settings of the HTTP face."""
-    return HttpSettings(listen=_pairs(config.http.listen), stop_grace_s=STOP_GRACE_S)
+    http = config.http
+    return HttpSettings(
+        listen=_pairs(http.listen),
+        stop_grace_s=STOP_GRACE_S,
+        basic_auth_file=http.basic_auth_file,
+        bearer_token_file=http.bearer_token_file,
+        tls_certificate=http.tls_certificate,
+        tls_private_key=http.tls_private_key,
+    )
 
 
 def history_settings(config: Config) -> HistorySettings:

@@ -11,10 +11,11 @@ import asyncio
 import random
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from types import MappingProxyType
 
-from prometheus_client import CollectorRegistry, Gauge, start_http_server
+from prometheus_client import CollectorRegistry, Gauge, GCCollector, ProcessCollector, start_http_server
+from prometheus_client.parser import text_string_to_metric_families
 
 from gateway.clock import SystemClock
 from gateway.core.site import Device, LineState, LineStatus, Outcome, Site, Ticket
@@ -23,8 +24,10 @@ from gateway.core.stats import LineStats, ModbusServerStats
 from gateway.devices.model import DeviceMap, Group, IdentityRules, Point, Space, Value
 from gateway.devices.schema import load_map
 from gateway.faces.http.app import HttpFace
-from gateway.faces.http.devices import device_labels, point_metric
+from gateway.faces.http.exposition import Exposition
+from gateway.faces.http.own import Counts
 from gateway.faces.http.settings import HttpSettings
+from gateway.faces.http.text import TEXT
 from gateway.service.loops import Loop, loop_factory
 
 DEVICES = 200
@@ -147,31 +150,32 @@ async def serve_gateway(controllers: Controllers) -> None:
 
 def serve_peer(controllers: Controllers) -> None:
     """The same series as ready-made gauges: the peer need not name, decode or leave out anything."""
+    exposition = Exposition(controllers.site, controllers.clock, Counts())
     registry = CollectorRegistry()
     gauges: dict[str, Gauge] = {}
     live: list[tuple[Gauge, Device, str]] = []
-    for device in controllers.devices:
-        labels = device_labels(controllers.site, device)
-        for point in device.map.points:
-            info = point_metric(point)
-            if info is None:
+    by_unit = {str(device.unit_id): device for device in controllers.devices}
+    points = {point.metric: point.name for point in controllers.devices[0].map.points}
+    for family in text_string_to_metric_families(asyncio.run(_joined(exposition)).decode()):
+        for sample in family.samples:
+            if sample.name.startswith(("process_", "python_")):
                 continue
-            if info.name not in gauges:
-                gauges[info.name] = Gauge(info.name, info.help, info.labels, registry=registry)
-            for extra in _names(device.map, point):
-                child = gauges[info.name].labels(*labels, *extra)
-                child.set(1)
-                if not extra:
-                    live.append((child, device, point.name))
+            if sample.name not in gauges:
+                gauges[sample.name] = Gauge(sample.name, family.documentation, list(sample.labels), registry=registry)
+            gauge = gauges[sample.name]
+            child = gauge.labels(**sample.labels) if sample.labels else gauge
+            child.set(sample.value)
+            if sample.name in points and not {"state", "bit"} & sample.labels.keys():
+                live.append((child, by_unit[sample.labels["unit_id"]], points[sample.name]))
+    ProcessCollector(registry=registry)
+    GCCollector(registry=registry)
     server, thread = start_http_server(0, "127.0.0.1", registry)
     say(str(server.server_port))
     for line in sys.stdin:
         if line.strip() == "change":
             controllers.change()
-            shown: Mapping[str, Value]
             for child, device, name in live:
-                shown = device.snapshot.values
-                child.set(shown[name])
+                child.set(device.snapshot.values[name])
             say("done")
         else:
             say("0")
@@ -180,12 +184,8 @@ def serve_peer(controllers: Controllers) -> None:
     thread.join()
 
 
-def _names(device_map: DeviceMap, point: Point) -> list[tuple[str, ...]]:
-    if point.enumeration is not None:
-        return [(entry.name,) for entry in device_map.enumerations[point.enumeration]]
-    if point.bits is not None:
-        return [(bit.name,) for bit in device_map.bit_tables[point.bits]]
-    return [()]
+async def _joined(exposition: Exposition) -> bytes:
+    return b"".join([piece async for piece in exposition.pieces(TEXT)])
 
 
 def main() -> None:

@@ -80,3 +80,19 @@ def test_two_names_of_one_port_are_noticed(tmp_path: Path) -> None:
 
 def test_a_face_that_is_off_needs_no_advice() -> None:
     assert advised(f"{HEAD}{LINE}[snmp]\nlisten = []\n") == ()
+
+
+def test_secret_files_are_looked_at(tmp_path: Path) -> None:
+    token = tmp_path / "token"
+    text = f'{CLEAN}[http]\nlisten = ["0.0.0.0:9850"]\nbearer_token_file = "{token}"\n'
+    [clear, unreadable] = advised(text)
+    assert clear.endswith("without TLS the secret is sent in clear")
+    assert unreadable == (
+        f"http.bearer_token_file: {token} cannot be read (No such file or directory); the HTTP face stays closed "
+        "until it can"
+    )
+    token.write_text("a-token-of-more-than-16")
+    token.chmod(0o644)
+    assert advised(text)[1:] == (f"http.bearer_token_file: {token} is open to every user of this machine (mode 644)",)
+    token.chmod(0o640)
+    assert len(advised(text)) == 1

@@ -58,6 +58,7 @@ def test_every_row_has_a_test() -> None:
         ("| SNMP reply | {} bytes |", REPLY_LIMIT),
         ("| HTTP connections of an address | {} |", HTTP.max_connections),
         ("| HTTP request header | {} s |", HTTP.idle_timeout_s),
+        ("| a reply that a scraper does not take | {} s |", HTTP.send_timeout_s),
         (
             'tried again, at most about {} s apart ([test](../tests/e2e/test_bad_input.py "test_a_busy',
             serial.LAST_RETRY_S,

@@ -217,6 +217,14 @@ listen = ["127.0.0.1:70000"]
         (MINIMAL + WRITE, "modbus.write[0]: allows nothing; allowed: point, registers or coils"),
         (MINIMAL + WRITE + "unit_id = [99]\n", "modbus.write[0].unit_id[0]: no device has unit id 99; allowed: 11"),
         (
+            MINIMAL + '[http]\ntls_certificate = "/etc/crt"\n',
+            "http.tls_private_key: is missing, and http.tls_certificate is there; allowed: both or neither",
+        ),
+        (
+            MINIMAL + '[http]\nbearer_token_file = "token"\n',
+            'http.bearer_token_file: "token" is not allowed; allowed: the absolute path of a file, or "" for none',
+        ),
+        (
             MINIMAL + WRITE + 'point = ["battery_voltage"]\n',
             'modbus.write[0].point[0]: "battery_voltage" can only be r',
         ),

@@ -1,4 +1,4 @@
-"""The HTTP face: `/metrics`, `/healthz`, `/readyz` and an index page from memory, `/api/v1/log` from the history.
+"""The HTTP face: `/metrics`, `/sd`, `/healthz`, `/readyz` and a page from memory, `/api/v1/log` from the history.
 
 Nothing here reads a line or waits for one, whatever is asked. `/healthz` answers as long as the loop runs;
 `/readyz` says whether the configuration is served as it stands, and is not about the controllers: one that
@@ -17,7 +17,9 @@ from gateway.core.daylog import DayLog
 from gateway.core.site import Site
 from gateway.core.stats import HistoryStats, ModbusServerStats
 from gateway.faces.http import api
+from gateway.faces.http.access import Access, guard
 from gateway.faces.http.api import LogApi
+from gateway.faces.http.discovery import targets
 from gateway.faces.http.exposition import Exposition, compressed
 from gateway.faces.http.listener import HttpListener
 from gateway.faces.http.own import Counts, HttpStats
@@ -64,9 +66,11 @@ class HttpFace:
         )
 
     def _application(self) -> web.Application:
-        application = web.Application(client_max_size=0)
+        guarded = guard(Access.read(self._settings), self._count_refused)
+        application = web.Application(client_max_size=0, middlewares=[guarded])
         application.router.add_get("/", self._index)
         application.router.add_get("/metrics", self._metrics)
+        application.router.add_get("/sd", self._discovery)
         application.router.add_get("/healthz", self._healthz)
         application.router.add_get("/readyz", self._readyz)
         application.router.add_get(api.PATH, self._log_api.handle)
@@ -97,6 +101,15 @@ class HttpFace:
         self.stats.scrapes += 1
         self.stats.scrape_s += self._clock.monotonic() - began
         return reply
+
+    async def _discovery(self, request: web.Request) -> web.Response:
+        assert request.transport is not None
+        host, port, *_ = request.transport.get_extra_info("sockname")
+        found = targets(self._site.name, request.host, (host, port), secure=request.secure)
+        return web.json_response(found, headers=_NO_STORE)
+
+    def _count_refused(self) -> None:
+        self.stats.refused += 1
 
     async def _healthz(self, _request: web.Request) -> web.Response:
         return web.Response(text="ok\n", headers=_NO_STORE)

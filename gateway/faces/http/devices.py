@@ -14,6 +14,7 @@ points whose value is another one are written anew. All lines of a device in one
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from gateway.core.polling import IDENTITY_MISMATCH, NOT_REWRITTEN
@@ -80,20 +81,11 @@ def point_metric(point: Point) -> MetricInfo | None:
 
 
 class _Writer(Protocol):
-    """How one point of a model becomes lines."""
+    """How a point that is more than one series becomes lines."""
 
     def lines(self, labels: bytes, value: Value) -> bytes:
         """The lines of the point's present value; `labels` are the device's."""
         ...
-
-
-class _Number:
-    def __init__(self, metric: str, scale: float) -> None:
-        self._begin = f"{metric}{{".encode()
-        self._scale = scale
-
-    def lines(self, labels: bytes, value: Value) -> bytes:
-        return self._begin + labels + b"}" + number(value * self._scale)
 
 
 class _OneOf:
@@ -126,16 +118,22 @@ class _Bits:
         return b"".join(named + unnamed)
 
 
-def _writer(model: DeviceMap, point: Point, metric: str) -> _Writer:
+def _writer(model: DeviceMap, point: Point, metric: str) -> _Writer | None:
     if point.enumeration is not None:
         return _OneOf(metric, {entry.number: entry.name for entry in model.enumerations[point.enumeration]})
     if point.bits is not None:
         return _Bits(metric, {bit.number: bit.name for bit in model.bit_tables[point.bits]})
-    return _Number(metric, point.metric_scale)
+    return None
 
 
-_Plan = tuple[tuple[int, str, _Writer], ...]
-"""Of one model: index of the family, name of the point, how it is written."""
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """How the points of one model are written: four columns with one entry a point."""
+
+    points: tuple[str, ...]
+    families: tuple[int, ...]
+    numbers: tuple[tuple[bytes, float], ...]  # how a plain number's line begins, and its scale
+    writers: tuple[_Writer | None, ...]  # None: it is a plain number
 
 
 class _DeviceLines:
@@ -144,8 +142,9 @@ class _DeviceLines:
     def __init__(self, device: Device, labels: bytes, plan: _Plan, families: int) -> None:
         self.device = device
         self.labels = labels
+        self._closed = labels + b"}"
         self._plan = plan
-        self._values: list[Value | None] = [None] * len(plan)
+        self._values: list[Value | None] = [None] * len(plan.points)
         self._lines: Lines = (b"",) * families
         self._written: Snapshot | None = None
 
@@ -158,12 +157,21 @@ class _DeviceLines:
         before = self._written
         if before is None or _status(before) != _status(snapshot):
             lines[: len(DEVICE_METRICS)] = _status_lines(self.labels, snapshot)
-        shown, values = snapshot.shown(), self._values
-        for index, (family, point, writer) in enumerate(self._plan):
-            value = shown.get(point)
-            if value != values[index]:
-                values[index] = value
-                lines[family] = b"" if value is None else writer.lines(self.labels, value)
+        plan, old = self._plan, self._values
+        values = list(map(snapshot.shown().get, plan.points))
+        # The one loop that runs for every value of every device: tens of thousands of times a scrape.
+        for index, value in enumerate(values):
+            if value != old[index]:
+                writer = plan.writers[index]
+                if value is None:
+                    line = b""
+                elif writer is None:
+                    begin, scale = plan.numbers[index]
+                    line = begin + self._closed + number(value * scale)
+                else:
+                    line = writer.lines(self.labels, value)
+                lines[plan.families[index]] = line
+        self._values = values
         self._written = snapshot
         self._lines = lines
         return lines
@@ -213,7 +221,7 @@ class DeviceMetrics:
         ]
 
     def _plan(self, model: DeviceMap) -> _Plan:
-        plan = []
+        columns: list[tuple[str, int, tuple[bytes, float], _Writer | None]] = []
         for point in model.points:
             info = point_metric(point)
             if info is None:
@@ -221,8 +229,13 @@ class DeviceMetrics:
             known = self._families.setdefault(info.name, info)
             if (known.kind, known.labels) != (info.kind, info.labels):
                 raise MapError(f"{model.model}: point {point.name}: metric {info.name} has other labels elsewhere")
-            plan.append((list(self._families).index(info.name), point.name, _writer(model, point, info.name)))
-        return tuple(plan)
+            family = list(self._families).index(info.name)
+            begin = f"{info.name}{{".encode()
+            columns.append((point.name, family, (begin, point.metric_scale), _writer(model, point, info.name)))
+        if not columns:
+            return _Plan((), (), (), ())
+        points, families, numbers, writers = zip(*columns, strict=True)
+        return _Plan(points, families, numbers, writers)
 
     def write(self) -> Iterator[Lines]:
         """Each device's lines, written as far as they changed; a step of the iteration is one device."""

@@ -2,7 +2,8 @@
 
 Rules: a connection that sends no whole request header, or no further request, within `idle_timeout_s` is
 closed. At most `max_connections` are kept: when one more comes, the one that has been open longest and has
-nothing left to send makes room, so that idle strangers cannot keep a scraper out.
+nothing left to send makes room, so that idle strangers cannot keep a scraper out. With TLS a connection counts
+from the end of its handshake, which has `idle_timeout_s` too.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from collections.abc import Callable
 from aiohttp import web
 
 from gateway.errors import ListenError
+from gateway.faces.http.access import tls_context
 from gateway.faces.http.own import HttpStats
 from gateway.faces.http.settings import HttpSettings
 
@@ -31,7 +33,7 @@ class HttpListener:
         settings: HttpSettings,
         stats: HttpStats,
     ) -> None:
-        """`application` makes the application to serve; aiohttp wants a new one for each start."""
+        """`application` makes the application, which aiohttp wants anew for each start, or raises ListenError."""
         self.label = f"http [{host}]:{port}" if ":" in host else f"http {host}:{port}"
         self._host = host
         self._port = port
@@ -54,8 +56,12 @@ class HttpListener:
         """Listen; ListenError names the address and why it cannot."""
         if self._server is not None:
             return
+        try:
+            application, tls = self._application(), tls_context(self._settings)
+        except ListenError as error:
+            raise ListenError(f"{self.label}: {error}") from None
         runner = web.AppRunner(
-            self._application(),
+            application,
             access_log=None,
             keepalive_timeout=self._settings.idle_timeout_s,
             shutdown_timeout=self._settings.stop_grace_s,
@@ -64,7 +70,13 @@ class HttpListener:
         self._runner = runner
         try:
             loop = asyncio.get_running_loop()
-            self._server = await loop.create_server(self._accept, self._host, self._port)
+            self._server = await loop.create_server(
+                self._accept,
+                self._host,
+                self._port,
+                ssl=tls,
+                ssl_handshake_timeout=None if tls is None else self._settings.idle_timeout_s,
+            )
         except OSError as error:
             await self.stop()
             reason = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror

@@ -8,6 +8,7 @@ from gateway.core.site import Device, LinePort, Site
 
 LINKS = (
     ("/metrics", "metrics for Prometheus"),
+    ("/sd", "this gateway for Prometheus' http_sd_config"),
     ("/healthz", "answers while the gateway runs"),
     ("/readyz", "answers 200 when everything that is configured listens"),
 )

@@ -14,3 +14,7 @@ class HttpSettings:
     idle_timeout_s: float = 5.0  # time for a request's header, and between two requests of a connection
     stop_grace_s: float = 1.0  # how long a stopping listener waits for replies under way
     send_timeout_s: float = 30.0  # time for a scraper to take a whole reply
+    basic_auth_file: str = ""  # lines of name:password; "" for none
+    bearer_token_file: str = ""  # one token; "" for none
+    tls_certificate: str = ""  # PEM; "" for plain HTTP
+    tls_private_key: str = ""

@@ -19,6 +19,7 @@ from gateway.core.site import Site
 from gateway.core.snapshot import DeviceState
 from gateway.devices.model import DeviceMap, Point, Value
 from gateway.faces.http.devices import AGE, CONDITION, CONDITIONS, DEVICE_LABELS, INFO, STATE, UP, point_metric
+from gateway.faces.http.history import DEVICE_HISTORY_RULES, STORE_RULES, DeviceHistoryView
 from gateway.faces.http.lines import DEVICE_RULES, LINE_RULES, LineView
 from gateway.faces.http.metric import Labels, MetricInfo, MetricKind
 from gateway.faces.http.own import GATEWAY_RULES, HTTP_RULES, MODBUS_RULES, SNMP_RULES, Counts, GatewayView
@@ -79,6 +80,17 @@ class Reference:
         yield from _rules(MODBUS_RULES, [(counts.modbus, ())])
         yield from _rules(SNMP_RULES, [(counts.snmp(), ())])
         yield from _rules(HTTP_RULES, [(counts.http, ())])
+        if counts.history is not None:
+            kept = counts.history.devices
+            yield from _rules(STORE_RULES, [(counts.history, ())])
+            yield from _rules(
+                DEVICE_HISTORY_RULES,
+                [
+                    (DeviceHistoryView(kept[device.unit_id], now), labels)
+                    for device, labels in devices
+                    if device.unit_id in kept
+                ],
+            )
 
     def _labels(self) -> list[Labels]:
         return [

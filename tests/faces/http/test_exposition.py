@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gzip
+from collections import Counter
 from dataclasses import replace
 
 import pytest
@@ -14,7 +15,7 @@ from prometheus_client.openmetrics.exposition import generate_latest as generate
 
 from gateway.core.site import Site
 from gateway.core.snapshot import DeviceState, Snapshot
-from gateway.core.stats import ModbusServerStats
+from gateway.core.stats import DeviceHistoryStats, HistoryStats, ModbusServerStats
 from gateway.devices.schema import load_map, models
 from gateway.faces.http.exposition import DEVICES_A_TURN, PIECE_BYTES, Exposition, compressed
 from gateway.faces.http.own import Counts, HttpStats
@@ -49,7 +50,11 @@ def busy_counts() -> Counts:
     modbus = ModbusServerStats(requests=7)
     modbus.exceptions[0x0B] = 4
     modbus.malformed['a "b"\\\n'] = 1
-    return Counts(modbus, lambda: {"bad_community": 6}, HttpStats(scrapes=5, scrape_s=0.123456789), lambda: ["no"])
+    history = HistoryStats(
+        {3: DeviceHistoryStats(harvests=2, failures=Counter(timeout=1), days=256, harvested_at=900.0)}
+    )
+    http = HttpStats(scrapes=5, scrape_s=0.123456789)
+    return Counts(modbus, lambda: {"bad_community": 6}, http, lambda: ["no"], history)
 
 
 def busy_site(clock: ManualClock, model: str) -> Site:
