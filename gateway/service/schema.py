@@ -139,11 +139,8 @@ _NAME = "1 to 64 printable characters, no blank at either end"
 _TEXT = "up to 255 printable ASCII characters"
 _LISTEN = 'a list of "IPv4:port" or "[IPv6]:port" such as "127.0.0.1:1502"; [] turns the face off'
 _NETWORK = 'a list of addresses or networks such as "127.0.0.0/8", "10.1.2.3" or "::1/128"'
-<<<<<<< HEAD
 _FILE = 'the absolute path of a file, or "" for none'
-=======
 _RANGES = 'a list of PDU addresses or ranges of them such as "0xE000-0xE005" or "0x0001"'
->>>>>>> main
 _LOOPBACK = ("127.0.0.0/8", "::1/128")
 _LINE = LineSettings(name="", index=1, port="")
 _POLL = PollSettings()
