@@ -42,6 +42,22 @@ def coils(address: int, first: int, count: int) -> bytes:
     return bits.to_bytes((count + 7) // 8, "little")
 
 
+ADDRESS = {11: 1, 12: 2, 21: 1}
+"""The address of each unit on its line."""
+
+
+def read(unit: int, first: int, count: int) -> tuple[bytes, bytes]:
+    """A request PDU and the reply it must get."""
+    data = registers(ADDRESS[unit], first, count)
+    return b"\x03" + first.to_bytes(2) + count.to_bytes(2), bytes((3, len(data))) + data
+
+
+READ_1 = bytes.fromhex("03 0000 0001")
+READ_80 = bytes.fromhex("03 0000 0050")
+GOOD = mbap.encode(1, 12, READ_1)
+GOOD_REPLY = mbap.encode(1, 12, b"\x03\x02" + registers(2, 0, 1))
+
+
 def device_map() -> DeviceMap:
     """The extents and functions of a ProStar without its points."""
     doc = "ProStar MPPT v05"

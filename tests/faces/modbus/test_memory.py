@@ -8,11 +8,8 @@ import pytest
 
 from gateway.core.snapshot import Block, DeviceState
 from gateway.devices.model import Identification, Space
-from gateway.errors import ReplyTimeout
 
-from .conftest import Running, coils, registers
-
-READ_80 = bytes.fromhex("03 0000 0050")
+from .conftest import READ_80, Running, coils, registers
 
 
 @pytest.mark.parametrize("function", [3, 4])
@@ -38,19 +35,6 @@ async def test_coils_come_from_the_snapshot(running: Running, function: int, fir
     assert not running.world.line(11).transactions
 
 
-async def test_f38_older_than_max_age_is_read_anew(running: Running) -> None:
-    world = running.world
-    world.poll(11)
-    client = await running.connect()
-    world.clock.now += 4.999
-    await client.query(11, READ_80)
-    assert not world.line(11).transactions
-    world.clock.now += 0.001
-    world.line(11).outcomes[1] = ReplyTimeout()
-    assert await client.query(11, READ_80) == b"\x83\x0b", "never by old data"
-    assert world.line(11).transactions == [(1, READ_80)]
-
-
 async def test_a_new_snapshot_replaces_a_ready_reply(running: Running) -> None:
     world = running.world
     world.poll(11)
@@ -71,18 +55,6 @@ async def test_a_device_that_is_not_online_is_not_answered_from_memory(running: 
     world.set_state(11, state)
     await client.query(11, READ_80)
     assert world.line(11).transactions == [(1, READ_80)]
-
-
-async def test_f39_a_read_over_two_blocks_is_one_serial_read(running: Running) -> None:
-    world = running.world
-    device = world.device(11)
-    now = world.clock.now
-    blocks = tuple(Block(Space.REGISTERS, at, 16, registers(9, at, 16), now) for at in (0, 16))
-    device.snapshot = replace(device.snapshot, state=DeviceState.ONLINE, blocks=blocks)
-    client = await running.connect()
-    pair = bytes.fromhex("03 000f 0002")
-    assert await client.query(11, pair) == b"\x03\x04" + registers(1, 15, 2)
-    assert world.line(11).transactions == [(1, pair)]
 
 
 async def test_a_clients_read_serves_others_until_it_is_old(running: Running) -> None:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import errno
-import socket
 from ipaddress import ip_network
 
 import pytest
 
 from gateway.faces.modbus.settings import LOOPBACK
 from gateway.faces.modbus.tcp import allowed, bind_problem, client_name
-
-from .conftest import Running
 
 
 @pytest.mark.parametrize(
@@ -62,20 +59,3 @@ def test_a_bind_problem_is_told_in_words(number: int) -> None:
 
 def test_another_bind_problem_is_told_as_the_system_does() -> None:
     assert bind_problem(OSError(errno.EMFILE, "Too many open files")) == "Too many open files"
-
-
-@pytest.mark.skipif(not hasattr(socket, "TCP_USER_TIMEOUT"), reason="only Linux has it")
-async def test_f33_a_peer_that_is_gone_is_found_out_within_a_minute(running: Running) -> None:
-    await running.connect()
-    await running.until(lambda: running.world.stats.open_connections == 1)
-    transport = next(iter(running.server._connections))._transport
-    assert transport is not None
-    sock = transport.get_extra_info("socket")
-    assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
-    assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
-    idle, interval, probes = (
-        sock.getsockopt(socket.IPPROTO_TCP, option)
-        for option in (socket.TCP_KEEPIDLE, socket.TCP_KEEPINTVL, socket.TCP_KEEPCNT)
-    )
-    assert idle + interval * probes <= 60
-    assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 20_000

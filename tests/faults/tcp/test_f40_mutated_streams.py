@@ -1,4 +1,4 @@
-"""Mutated streams end only in what is documented, and the server goes on."""
+"""F40: random bytes and mutated streams end only in what is documented, and the server goes on."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ from gateway.core.stats import ModbusServerStats
 from gateway.faces.modbus.server import ModbusServer
 from gateway.faces.modbus.settings import ModbusSettings
 from gateway.modbus import mbap
-
-from .conftest import Client, World, registers
+from tests.faces.modbus.conftest import Client, World, registers
 
 DOCUMENTED = {1, 2, 3, 4, 6, 0x0A, 0x0B}
 SIZES = st.integers(0, 0xFFFF) | st.integers(0, 130)
@@ -103,7 +102,7 @@ async def exchange(world: World, stream: bytes, cuts: list[int]) -> tuple[list[m
 @pytest.mark.parametrize("cached", [False, True])
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], max_examples=60)
 @given(stream=streams(), cuts=st.lists(st.integers(1, 200), max_size=5))
-def test_f40_mutated_streams_give_only_documented_outcomes(
+def test_mutated_streams_give_only_documented_outcomes(
     world: World, cached: bool, stream: bytes, cuts: list[int]
 ) -> None:
     if cached:
