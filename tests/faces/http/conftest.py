@@ -53,9 +53,10 @@ class UnreadableLine:
     stats: LineStats = field(default_factory=LineStats)
     state: LineState = LineState.OPEN
     error: str = ""
+    echo: str = "absent"
 
     def status(self, now: float) -> LineStatus:
-        return LineStatus(self.state, 0.0, self.error, queue_depth=2, use_ratio=0.25)
+        return LineStatus(self.state, 0.0, self.error, queue_depth=2, use_ratio=0.25, echo=self.echo)
 
     def read(self, device: object, pdu: bytes, done: object, *, client: str = "", background: bool = False) -> NoReturn:
         pytest.fail("the HTTP face read a line")

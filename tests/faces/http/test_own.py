@@ -131,6 +131,7 @@ def test_where_the_time_of_a_line_goes(site: Site, clock: ManualClock) -> None:
         ("line_queue_wait_seconds_bucket", {"line": "shelter-a", "le": "0.01"}, 0),
         ("line_queue_wait_seconds_count", {"line": "shelter-a"}, 1),
         ("line_stretch_ratio", {"line": "shelter-a"}, 1),
+        ("line_echo", {"line": "shelter-a"}, 0),
         ("device_errors_total", {"device": "array-1", "kind": "crc"}, 3),
         ("device_errors_total", {"device": "array-2", "kind": "timeout"}, 0),
     ):
