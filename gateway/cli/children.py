@@ -11,6 +11,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
@@ -40,18 +41,18 @@ def start_gateway_command(arguments: Sequence[str], log: IO[bytes]) -> subproces
 
 
 def stop_all(children: Sequence[subprocess.Popen[bytes]]) -> None:
-    """End every child: SIGTERM to all, SIGKILL to what still lives 1.5 s later."""
+    """End every child: SIGTERM to all, SIGKILL to what still lives 1.5 s after that."""
     for child in children:
         if child.poll() is None:
             child.terminate()
-    waited = 0.0
+    until = time.monotonic() + STOP_S
     for child in children:
         try:
-            child.wait(timeout=max(0.05, STOP_S - waited))
+            child.wait(timeout=max(0.0, until - time.monotonic()))
         except subprocess.TimeoutExpired:
-            waited = STOP_S
             child.kill()
-            child.wait()
+    for child in children:
+        child.wait()
 
 
 def last_lines(log: Path, count: int = 8) -> list[str]:
