@@ -108,6 +108,7 @@ class Asker:
         self._socket.connect(("127.0.0.1", port))
         self._socket.settimeout(1)
         self.user: LocalUser | None = None
+        self._sealers: dict[LocalUser | None, v3.Sealer] = {}
         self.authority = v3.Authority(b"", 0, 0)
 
     def __enter__(self) -> Self:
@@ -133,7 +134,10 @@ class Asker:
     def sealed(self, user: LocalUser | None, flags: int, pdu: bytes, number: int = 1) -> bytes:
         """An SNMPv3 message around a PDU."""
         scoped = v3.scoped(self.authority.engine_id, b"", pdu)
-        return v3.seal(user, self.authority, wire.integer(0x02, number), flags, scoped)
+        return self._sealer(user).seal(self.authority, wire.integer(0x02, number), flags, scoped)
+
+    def _sealer(self, user: LocalUser | None) -> v3.Sealer:
+        return self._sealers.setdefault(user, v3.Sealer(user))
 
     def request(self, question: Question, number: int, name: bytes) -> bytes:
         """A whole request message."""

@@ -26,8 +26,8 @@ from gateway.faces.snmp.tree import Window
 
 _log = logging.getLogger(__name__)
 
-MOST_ANSWERS = 20_000
-MOST_OCTETS = 8 << 20
+MOST_ANSWERS = 4096
+MOST_OCTETS = 4 << 20
 _OBJECT_OCTETS = 500
 """What an answer takes besides its octets, about."""
 
@@ -61,7 +61,6 @@ class Answer:
     __slots__ = (
         "_device",
         "_devices",
-        "_head",
         "_request",
         "_seen",
         "_snapshots",
@@ -72,6 +71,7 @@ class Answer:
         "before",
         "charged",
         "grant",
+        "head",
         "lasting",
         "room",
     )
@@ -82,7 +82,7 @@ class Answer:
         self._window = window
         self._request = request
         self._version = version
-        self._head = head
+        self.head = head
         self.room = room
         self.grant = grant
         self.before = self.after = b""
@@ -159,9 +159,9 @@ class Answer:
     def _put(self, result: bytes) -> None:
         request_id = self._request.request_id
         before = wire.head(wire.RESPONSE, len(request_id) + len(result)) + request_id[:2]
-        if self._head is not None:
-            size = len(self._head) + len(before) + len(request_id) - 2 + len(result)
-            before = wire.head(0x30, size) + self._head + before
+        if self.head is not None:
+            size = len(self.head) + len(before) + len(request_id) - 2 + len(result)
+            before = wire.head(0x30, size) + self.head + before
         self.before, self.after = before, result
 
 

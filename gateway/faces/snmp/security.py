@@ -79,6 +79,9 @@ class Security:
         self.engine = engine
         self._counters = counters
         self._users = {each.name: LocalUser(each, engine.engine_id) for each in users}
+        self._sealers = {name: v3.Sealer(user) for name, user in self._users.items()}
+        self._clear = v3.Sealer(None)
+        self._authority = v3.Authority(engine.engine_id, engine.boots, 0)
 
     def open(self, message: v3.Message, usable: Container[bytes], now: float) -> Opened:
         """Check and decrypt a message; `usable` are the names that count where it came from. Raises Rejected."""
@@ -111,7 +114,8 @@ class Security:
     def reply(self, opened: Opened, pdu: bytes, now: float) -> bytes:
         """The message that answers `opened` with `pdu`."""
         body = v3.scoped(self.engine.engine_id, opened.scope.context, pdu)
-        return v3.seal(opened.user, self._authority(now), opened.message.message_id, v3.AUTH | v3.PRIV, body)
+        sealer = self._sealers[opened.user.name]
+        return sealer.seal(self._authority_at(now), opened.message.message_id, v3.AUTH | v3.PRIV, body)
 
     def overhead(self, opened: Opened) -> int:
         """Octets of a reply around its PDU, at most."""
@@ -130,10 +134,15 @@ class Security:
         pdu = wire.tlv(wire.REPORT, _PDU_HEAD + wire.tlv(0x30, wire.counter(rejection.oid, count)))
         body = v3.scoped(self.engine.engine_id, b"", pdu)
         self._counters.reports += 1
-        return Rejected(rejection, v3.seal(user, self._authority(now), message.message_id, flags, body))
+        sealer = self._clear if user is None else self._sealers[user.name]
+        return Rejected(rejection, sealer.seal(self._authority_at(now), message.message_id, flags, body))
 
-    def _authority(self, now: float) -> v3.Authority:
-        return v3.Authority(self.engine.engine_id, self.engine.boots, self.engine.time(now))
+    def _authority_at(self, now: float) -> v3.Authority:
+        """This engine at `now`; the same object within a second."""
+        time = self.engine.time(now)
+        if time != self._authority.time:
+            self._authority = v3.Authority(self.engine.engine_id, self.engine.boots, time)
+        return self._authority
 
     @staticmethod
     def _authentic(message: v3.Message, user: LocalUser) -> bool:

@@ -18,6 +18,9 @@ USER_BASED = 3
 MIN_MAX_SIZE = 484
 """RFC 3412 §6.1: every engine takes messages of this size."""
 
+MAX_USER_NAME = 32
+"""RFC 3414 §2.4."""
+
 OWN_MAX_SIZE = 1472
 """What we take: one Ethernet frame after IPv4 and UDP headers."""
 
@@ -27,23 +30,28 @@ _FLAGS = [wire.tlv(0x04, bytes((flags,))) for flags in range(8)]
 _SIZE = wire.integer(0x02, OWN_MAX_SIZE)
 
 
-@dataclass(frozen=True, slots=True)
 class Message:
     """A message that came, its security not yet looked at."""
 
-    data: bytes
-    message_id: bytes  # encoded INTEGER
-    max_size: int
-    flags: int
-    model: int
-    engine_id: bytes
-    boots: int
-    time: int
-    user: bytes
-    mac_at: int  # where the authenticator is in `data`
-    mac: bytes
-    salt: bytes
-    body_at: int  # where the scoped PDU, plain or encrypted, begins
+    __slots__ = (
+        "body_at", "boots", "data", "engine_id", "flags", "mac", "mac_at", "max_size", "message_id", "model", "salt",
+        "time", "user",
+    )  # fmt: skip
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+        self.message_id = b""  # encoded INTEGER
+        self.max_size = 0
+        self.flags = 0
+        self.model = 0
+        self.engine_id = b""
+        self.boots = 0
+        self.time = 0
+        self.user = b""
+        self.mac_at = 0  # where the authenticator is in `data`
+        self.mac = b""
+        self.salt = b""
+        self.body_at = 0  # where the scoped PDU, plain or encrypted, begins
 
 
 class Authority(NamedTuple):
@@ -65,34 +73,36 @@ class Scope:
 
 def parse(data: bytes, at: int) -> Message:
     """The message whose version ends at `at`; NotSnmp when it is none."""
+    message = Message(data)
     end = len(data)
     first, body = content(data, at, end, 0x30)
-    message_id, at = integer(data, first, body)
-    encoded_id = data[first:at]
-    max_size, at = integer(data, at, body)
+    number, at = integer(data, first, body)
+    message.message_id = data[first:at]
+    message.max_size, at = integer(data, at, body)
     start, at = content(data, at, body, 0x04)
-    model, at_end = integer(data, at, body)
-    if at - start != 1 or at_end != body or message_id < 0 or max_size < MIN_MAX_SIZE or model < 1:
+    message.flags = data[start]
+    size = at - start
+    message.model, at = integer(data, at, body)
+    if size != 1 or at != body or number < 0 or message.max_size < MIN_MAX_SIZE or message.model < 1:
         raise NotSnmp("msgGlobalData")
-    flags = data[start]
-    if model != USER_BASED:
-        return Message(data, encoded_id, max_size, flags, model, b"", 0, 0, b"", 0, b"", b"", 0)
+    if message.model != USER_BASED:
+        return message
     start, after = content(data, body, end, 0x04)
     at, stop = content(data, start, after, 0x30)
     first, at = content(data, at, stop, 0x04)
-    engine_id = data[first:at]
-    boots, at = integer(data, at, stop)
-    time, at = integer(data, at, stop)
+    message.engine_id = data[first:at]
+    message.boots, at = integer(data, at, stop)
+    message.time, at = integer(data, at, stop)
     first, at = content(data, at, stop, 0x04)
-    user = data[first:at]
-    mac_at, at = content(data, at, stop, 0x04)
-    mac = data[mac_at:at]
+    message.user = data[first:at]
+    message.mac_at, at = content(data, at, stop, 0x04)
+    message.mac = data[message.mac_at : at]
     first, at = content(data, at, stop, 0x04)
-    if at != stop or stop != after or boots < 0 or time < 0 or len(user) > 32:
+    message.salt = data[first:at]
+    if at != stop or stop != after or message.boots < 0 or message.time < 0 or len(message.user) > MAX_USER_NAME:
         raise NotSnmp("msgSecurityParameters")
-    return Message(
-        data, encoded_id, max_size, flags, model, engine_id, boots, time, user, mac_at, mac, data[first:at], after
-    )
+    message.body_at = after
+    return message
 
 
 def scope(data: bytes, at: int) -> Scope:
@@ -116,26 +126,58 @@ def vector(boots: int, time: int, salt: bytes) -> bytes:
     return boots.to_bytes(4, "big") + time.to_bytes(4, "big") + salt
 
 
-def seal(user: LocalUser | None, authority: Authority, message_id: bytes, flags: int, body: bytes) -> bytes:
-    """A whole message around the scoped PDU `body`, signed and encrypted as `flags` say.
+class Sealer:
+    """Makes messages of one user at one authoritative engine; `user` None: in clear, without a name.
 
-    `message_id` is an encoded INTEGER; `user` may be None without AUTH and PRIV.
+    What stands before the authenticator changes once a second and is kept.
     """
-    engine_id, boots, time = authority
-    name, mac, salt = b"", b"", b""
-    if flags & AUTH:
-        assert user is not None
-        name, mac = user.name, bytes(user.mac.size)
-    if flags & PRIV:
-        assert user is not None
-        salt = user.salt()
-        body = wire.tlv(0x04, user.cfb.encrypt(vector(boots, time, salt), body))
-    head = wire.tlv(0x04, engine_id) + wire.integer(0x02, boots) + wire.integer(0x02, time) + wire.tlv(0x04, name)
-    tail = wire.tlv(0x04, salt)
-    security = wire.tlv(0x04, wire.tlv(0x30, head + wire.tlv(0x04, mac) + tail))
-    rest = wire.tlv(0x30, message_id + _SIZE + _FLAGS[flags] + _GLOBAL_TAIL) + security + body
-    message = wire.tlv(0x30, _VERSION + rest)
-    if user is None or not flags & AUTH:
-        return message
-    stop = len(message) - len(body) - len(tail)
-    return message[: stop - user.mac.size] + user.mac.of(message) + message[stop:]
+
+    __slots__ = ("_authority", "_before", "_user")
+
+    def __init__(self, user: LocalUser | None) -> None:
+        self._user = user
+        self._authority: Authority | None = None
+        self._before = [b""] * 4
+
+    def seal(self, authority: Authority, message_id: bytes, flags: int, body: bytes) -> bytes:
+        """A whole message around the scoped PDU `body`, signed and encrypted as `flags` say.
+
+        `message_id` is an encoded INTEGER. Without a user the flags AUTH and PRIV cannot be set.
+        """
+        if authority is not self._authority:
+            self._authority = authority
+            self._before = [self._security(authority, flags) for flags in range(4)]
+        user = self._user
+        before = self._before[flags & (AUTH | PRIV)]
+        if user is None or not flags & AUTH:
+            return wire.tlv(0x30, _VERSION + _global(message_id, flags) + before + _EMPTY + _EMPTY + body)
+        after = _EMPTY
+        if flags & PRIV:
+            salt = user.salt()
+            after = _SALT + salt
+            body = wire.tlv(0x04, user.cfb.encrypt(vector(authority.boots, authority.time, salt), body))
+        size = user.mac.size
+        start = _VERSION + _global(message_id, flags) + before + _SHORT_STRING[size]
+        message = wire.tlv(0x30, start + bytes(size) + after + body)
+        at = len(message) - len(body) - len(after) - size
+        return message[:at] + user.mac.of(message) + message[at + size :]
+
+    def _security(self, authority: Authority, flags: int) -> bytes:
+        """The security parameters up to the authenticator, of a message with these flags."""
+        name = self._user.name if self._user is not None and flags & AUTH else b""
+        mac = self._user.mac.size if self._user is not None and flags & AUTH else 0
+        salt = 8 if flags & PRIV else 0
+        head = wire.tlv(0x04, authority.engine_id) + wire.integer(0x02, authority.boots)
+        head += wire.integer(0x02, authority.time) + wire.tlv(0x04, name)
+        inner = len(head) + 2 + mac + 2 + salt
+        sequence = wire.head(0x30, inner)
+        return wire.head(0x04, len(sequence) + inner) + sequence + head
+
+
+_EMPTY = wire.tlv(0x04, b"")
+_SALT = wire.head(0x04, 8)
+_SHORT_STRING = [wire.head(0x04, size) for size in range(0x80)]
+
+
+def _global(message_id: bytes, flags: int) -> bytes:
+    return wire.tlv(0x30, message_id + _SIZE + _FLAGS[flags] + _GLOBAL_TAIL)
