@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from gateway.generate.dashboards import dashboard_outputs
 from gateway.generate.metrics import metric_outputs
 from gateway.generate.mib import mib_outputs
 from gateway.generate.registers import register_outputs
@@ -17,7 +18,7 @@ from gateway.generate.rules import rule_outputs
 def outputs() -> dict[str, str]:
     """Every derived file: path from the repository's root → text."""
     made: dict[str, str] = {}
-    for part in (mib_outputs(), register_outputs(), metric_outputs(), rule_outputs()):
+    for part in (mib_outputs(), register_outputs(), metric_outputs(), rule_outputs(), dashboard_outputs()):
         for path, text in part.items():
             if path in made:
                 raise ValueError(f"{path} is made twice")
