@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from gateway.cli import check_config, demo, generate, log, run, scan, simulate, writes
+from gateway.cli import check_config, clients, demo, generate, log, run, scan, simulate, writes
 
 app = typer.Typer(
     help="Modbus TCP, SNMP and Prometheus for Morningstar ProStar MPPT controllers on serial lines.",
@@ -20,6 +20,7 @@ app.command("check-config")(check_config.command)
 app.command("demo")(demo.command)
 app.command("simulate")(simulate.command)
 app.command("scan")(scan.command)
+app.command("clients")(clients.command)
 app.command("writes")(writes.command)
 app.command("generate")(generate.command)
 app.command("log")(log.command)

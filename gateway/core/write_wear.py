@@ -64,9 +64,5 @@ class Wear:
         """A write of an earlier run, `age_s` ago by the wall clock."""
         self._spent(cell, now - max(0.0, age_s))
 
-    def history(self, now: float) -> list[tuple[Cell, float]]:
-        """The writes of the last day to registers that wear, each with its age in seconds."""
-        return [(cell, now - at) for cell, worn in self._worn.items() for at in worn if now - at < DAY_S]
-
     def _spent(self, cell: Cell, at: float) -> None:
         self._worn[cell] = sorted((*self._worn.get(cell, ()), at))[-self._limits.per_day :]

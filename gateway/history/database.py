@@ -104,7 +104,10 @@ def open_database(directory: Path) -> sqlite3.Connection:
     """The history of this directory, for writing; made when it is not there. HistoryError when that cannot be."""
     path = directory / FILE_NAME
     with explained(directory):
-        directory.mkdir(mode=0o750, parents=True, exist_ok=True)
+        try:
+            directory.mkdir(mode=0o750, parents=True, exist_ok=True)
+        except FileExistsError:
+            raise HistoryError("unwritable", f"{directory}: is no directory") from None
     try:
         return _open(path)
     except HistoryError as error:

@@ -64,6 +64,7 @@ class Gateway:
             not_ready=self.not_ready,
             history=history,
             log=None if history is None else HistorySource(kept.directory, config.site),
+            clients=modbus.clients,
         )
         self.keepers = () if history is None else (HistoryKeeper(kept, self.site, clock, history),)
         self.listeners: tuple[Listener, ...] = (*modbus.listeners, *snmp.listeners, *http.listeners)

@@ -17,6 +17,7 @@ from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from gateway.core.ratelimit import ClientRate, LineRates
 from gateway.core.settings import LineSettings, PollSettings
 from gateway.core.write_wear import WearLimits
 
@@ -130,6 +131,7 @@ Listen = Annotated[str, AfterValidator(_listen)]
 Network = Annotated[str, AfterValidator(_network)]
 Seconds = Annotated[float, Field(allow_inf_nan=False)]
 Hours = Annotated[float, Field(allow_inf_nan=False)]
+Rate = Annotated[float, Field(allow_inf_nan=False)]
 Listens = Annotated[tuple[Listen, ...], Field(strict=False)]
 AbsolutePath = Annotated[str, Field(pattern=r"^(/[^\x00-\x1f]*)?$")]
 Networks = Annotated[tuple[Network, ...], Field(strict=False)]
@@ -144,6 +146,9 @@ _RANGES = 'a list of PDU addresses or ranges of them such as "0xE000-0xE005" or 
 _LOOPBACK = ("127.0.0.0/8", "::1/128")
 _LINE = LineSettings(name="", index=1, port="")
 _POLL = PollSettings()
+_CLIENT_RATE = ClientRate()
+_LINE_RATES = LineRates()
+_RATE = "0.0 to 1000000.0 a second; 0.0 is no limit"
 _WEAR = WearLimits()
 
 
@@ -297,6 +302,47 @@ class WriteTable(Table):
     coils: Annotated[Ranges, Key(_RANGES, "Further coils, without those that must be named.")] = ()
 
 
+class ClientNetworkTable(Table):
+    """`[[modbus.rate.network]]`: other rates for some clients; the first table that names an address decides."""
+
+    source: Annotated[Networks, Key(_NETWORK + ", at least one", "For whom.")] = Field(min_length=1)
+    requests_per_s: Annotated[Rate, Key(_RATE, "As in [modbus.rate].")] = Field(
+        default=_CLIENT_RATE.requests_per_s, ge=0.0, le=1e6
+    )
+    client_line_per_s: Annotated[Rate, Key(_RATE, "As in [modbus.rate].")] = Field(
+        default=_CLIENT_RATE.line_per_s, ge=0.0, le=1e6
+    )
+
+
+class RateTable(Table):
+    """`[modbus.rate]`: how often clients may ask; beyond it 06, then the client is not read from for up to 1 s."""
+
+    requests_per_s: Annotated[
+        Rate,
+        Key(
+            _RATE,
+            "Requests of one client address, mostly answered from memory; this machine itself has no such limit, "
+            "unless a network names it.",
+        ),
+    ] = Field(default=_CLIENT_RATE.requests_per_s, ge=0.0, le=1e6)
+    client_line_per_s: Annotated[Rate, Key(_RATE, "Of these, requests that need a line.")] = Field(
+        default=_CLIENT_RATE.line_per_s, ge=0.0, le=1e6
+    )
+    device_per_s: Annotated[Rate, Key(_RATE, "The same of all clients together, for one controller.")] = Field(
+        default=_LINE_RATES.device_per_s, ge=0.0, le=1e6
+    )
+    line_per_s: Annotated[Rate, Key(_RATE, "The same of all clients together, for one line.")] = Field(
+        default=_LINE_RATES.line_per_s, ge=0.0, le=1e6
+    )
+    burst_s: Annotated[Seconds, Key("0.1 to 60.0", "How many seconds' worth may come at once.")] = Field(
+        default=2.0, ge=0.1, le=60.0
+    )
+    network: Annotated[
+        Annotated[tuple[ClientNetworkTable, ...], Field(strict=False)],
+        Key("[[modbus.rate.network]] tables", "Other rates for the clients of some networks."),
+    ] = ()
+
+
 class ModbusTable(Table):
     """`[modbus]`: the Modbus TCP face."""
 
@@ -305,6 +351,14 @@ class ModbusTable(Table):
         int,
         Key("1 to 1024", "How many clients may be connected at once, over all listen addresses."),
     ] = Field(default=64, ge=1, le=1024)
+    max_per_client: Annotated[
+        int,
+        Key("1 to 1024", "How many connections one client address may have at once."),
+    ] = Field(default=64, ge=1, le=1024)
+    priority: Annotated[
+        Networks,
+        Key(_NETWORK, "Clients that always get in: over a limit, a connection without priority makes room."),
+    ] = ()
     allow: Annotated[Networks, Key(_NETWORK, "Who may connect; others are closed before a byte is read.")] = _LOOPBACK
     strict_map: Annotated[
         bool,
@@ -332,6 +386,7 @@ class ModbusTable(Table):
         Annotated[tuple[WriteTable, ...], Field(strict=False)],
         Key("[[modbus.write]] tables", "Who may write what; without one nobody can."),
     ] = ()
+    rate: Annotated[RateTable, Key("a [modbus.rate] table", "How often clients may ask.")] = RateTable()
     listener: Annotated[
         Annotated[tuple[ListenerTable, ...], Field(strict=False)],
         Key(

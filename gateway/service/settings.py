@@ -7,14 +7,15 @@ from pathlib import Path
 
 from gateway.core.budget import WATCH_S, LineBudget, line_budget
 from gateway.core.identity import Identity
+from gateway.core.ratelimit import ClientRate, LineRates
 from gateway.core.settings import LineSettings, PollSettings
 from gateway.core.site import Device
 from gateway.devices.schema import load_map
 from gateway.faces.http.settings import HttpSettings
-from gateway.faces.modbus.settings import LineListen, ModbusSettings
+from gateway.faces.modbus.settings import LineListen, ModbusSettings, Network, RateSettings
 from gateway.faces.snmp.settings import Community, SnmpSettings
 from gateway.history.settings import HistorySettings
-from gateway.service.schema import Config, LineTable, parse_listen, parse_root
+from gateway.service.schema import Config, LineTable, RateTable, parse_listen, parse_root
 from gateway.service.writes import line_writes, write_rules, write_settings
 
 Pairs = tuple[tuple[str, int], ...]
@@ -85,7 +86,10 @@ def modbus_settings(config: Config) -> ModbusSettings:
         listen=_pairs(modbus.listen),
         lines=tuple(LineListen(_pairs(listener.listen), listener.line) for listener in modbus.listener),
         max_connections=modbus.max_connections,
-        allow=tuple(ipaddress.ip_network(network) for network in modbus.allow),
+        max_per_client=modbus.max_per_client,
+        priority=_networks(modbus.priority),
+        rate=_rates(modbus.rate),
+        allow=_networks(modbus.allow),
         max_age_s=config.cache.max_age_s,
         writes=write_settings(config),
         strict_map=modbus.strict_map,
@@ -125,6 +129,27 @@ def http_settings(config: Config) -> HttpSettings:
 def history_settings(config: Config) -> HistorySettings:
     """The settings of the history; whether there is one is `config.history.enabled`."""
     return HistorySettings(Path(config.state_dir), interval_s=config.history.interval_h * 3600)
+
+
+def _rates(rate: RateTable) -> RateSettings:
+    defaults = RateSettings()
+    named = tuple(
+        (_networks(table.source), ClientRate(table.requests_per_s, table.client_line_per_s)) for table in rate.network
+    )
+    # What holds for this machine itself comes last, and is as strict as the file about its use of the lines.
+    own = tuple(
+        (networks, ClientRate(local.requests_per_s, rate.client_line_per_s)) for networks, local in defaults.networks
+    )
+    return RateSettings(
+        client=ClientRate(rate.requests_per_s, rate.client_line_per_s),
+        lines=LineRates(rate.device_per_s, rate.line_per_s),
+        burst_s=rate.burst_s,
+        networks=named + own,
+    )
+
+
+def _networks(texts: tuple[str, ...]) -> tuple[Network, ...]:
+    return tuple(ipaddress.ip_network(text) for text in texts)
 
 
 def _pairs(listens: tuple[str, ...]) -> Pairs:

@@ -8,9 +8,12 @@ import time
 
 from gateway.cli.children import STOP_S, stop_all
 
-STUBBORN = (
-    "import signal, sys; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up', flush=True); sys.stdin.read()"
-)
+STUBBORN = """
+import signal, sys
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+print("up", flush=True)
+sys.stdin.read()
+"""
 
 
 def stubborn() -> subprocess.Popen[bytes]:

@@ -34,7 +34,7 @@ def test_the_command_and_the_module_are_the_same(command: list[str]) -> None:
 def test_help_names_every_command() -> None:
     status, shown, _ = run("--help")
     assert status == 0
-    for command in ("run", "check-config", "demo", "simulate", "scan", "generate"):
+    for command in ("run", "check-config", "demo", "simulate", "scan", "clients", "generate"):
         assert f" {command} " in shown
 
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import sqlite3
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,11 @@ import pytest
 
 from gateway.devices.log import decode_log, split_blocks
 from gateway.devices.model import Space, WordOrder
+from gateway.errors import HistoryError
 from gateway.history.database import FILE_NAME
+from gateway.history.store import Store
 from gateway.simulator.device import SimulatedController
+from gateway.simulator.server import missing
 from tests.history.blocks import HI_LO, LAYOUT, LO_HI, MAP
 from tests.history.virtual_site import VirtualClock, VirtualGateway, VirtualPort
 
@@ -107,7 +110,7 @@ async def test_five_days_without_the_gateway_leave_no_gap(
     assert len(after.keys() - before.keys()) == 5
     assert stored(tmp_path) == before | after
     dates = rows(tmp_path, "SELECT written_wall, error_s FROM day ORDER BY hourmeter")
-    assert all(23 * 3600 < later[0] - earlier[0] < 25 * 3600 for earlier, later in itertools.pairwise(dates))
+    assert all(23 * 3600 < later[0] - earlier[0] < 25 * 3600 for earlier, later in pairwise(dates))
 
 
 async def test_five_days_without_the_line_leave_no_gap(tmp_path: Path, gateway: Gateways, clock: VirtualClock) -> None:
@@ -226,3 +229,202 @@ async def test_serial_numbers_name_controllers_and_follow_them(tmp_path: Path, g
     ]
     assert stored(tmp_path, "array-2") == truth(one)
     assert stored(tmp_path, "array-1") == truth(two)
+
+
+# Trouble
+
+
+def log_reads(running: VirtualGateway) -> list[tuple[float, bytes]]:
+    return [(at, frame) for at, frame in running.port.sent if frame[1] == 3 and 0x80 <= frame[2] < 0xE0]
+
+
+async def test_a_noisy_line_costs_time_and_no_day(tmp_path: Path, gateway: Gateways) -> None:
+    controller = unit(seed=0)
+    async with gateway(controller) as running:
+        for _ in range(60):
+            running.port.wire.corrupt_replies(1)
+            await running.run(1.7)
+        await running.until(lambda: running.stats.devices[11].harvests)
+        assert running.stats.devices[11].apart == 0
+        assert running.port.engine.stats.failed["crc"] > 20
+    assert stored(tmp_path) == truth(controller)
+
+
+class Picky(SimulatedController):
+    """Takes reads of the log of one block only, and not all of them."""
+
+    picky = True
+
+    def read(self, space: Space, first: int, count: int, now: float) -> list[int]:
+        if self.picky and 0x8000 <= first < 0x9000 and (count > 16 or first == 0x8000 + 16 * 77):
+            raise missing(space, first)
+        return super().read(space, first, count, now)
+
+
+async def test_reads_get_shorter_and_a_refused_block_is_tried_again(tmp_path: Path, gateway: Gateways) -> None:
+    controller = Picky(MAP, seed=0, step_s=60.0)
+    async with gateway(controller) as running:
+        await running.until(lambda: running.stats.devices[11].days == 255)
+        stats = running.stats.devices[11]
+        assert (stats.harvests, stats.failures["unread_blocks"]) == (0, 1)
+        before = len(log_reads(running))
+        controller.picky = False
+        await running.until(lambda: running.stats.devices[11].harvests)
+        assert len(log_reads(running)) > before
+    assert stored(tmp_path) == truth(controller)
+
+
+async def test_a_line_that_fails_on_the_way_costs_nothing(
+    tmp_path: Path, gateway: Gateways, clock: VirtualClock
+) -> None:
+    controller = unit(seed=0)
+    async with gateway(controller) as running:
+        for _ in range(4):
+            reads = len(log_reads(running))
+            await running.until(lambda reads=reads: len(log_reads(running)) > reads + 5)  # type: ignore[misc]  # bound
+            running.port.engine.closed("unplugged", clock.now)
+            await running.run(30.0)
+            running.port.wire.clear()
+            running.port.engine.opened(clock.now)
+        await running.until(lambda: running.stats.devices[11].harvests)
+        assert len(log_reads(running)) <= 37 + 4 * 3
+        assert running.stats.devices[11].failures["line_down"] >= 1
+    assert stored(tmp_path) == truth(controller)
+
+
+async def test_live_polls_do_not_notice_the_harvest(gateway: Gateways) -> None:
+    async with gateway(unit(seed=0), live_s=1.0) as running:
+        await running.until(lambda: running.stats.devices[11].harvests)
+        live = [at for at, frame in running.port.sent if frame[1] == 3 and frame[2] < 0x80]
+        log = [at for at, _ in log_reads(running)]
+        assert len(log) == 37
+        during = [at for at in live if log[0] <= at <= log[-1]]
+        assert during
+        gaps = [later - earlier for earlier, later in pairwise(during)]
+        assert max(gaps) < 1.01
+        device = running.port.devices[0]
+        assert device.stats.refresh_s == pytest.approx(1.0, abs=0.01)
+
+
+async def test_what_cannot_be_stored_disturbs_nobody_and_is_caught_up_later(
+    tmp_path: Path, clock: VirtualClock, caplog: pytest.LogCaptureFixture
+) -> None:  # F80
+    controller = unit(seed=0)
+    obstacle = tmp_path / "state"
+    obstacle.write_text("a file where the directory should be")
+    running = VirtualGateway(obstacle, clock, VirtualPort(clock, [controller], 5.0))
+    async with running:
+        await running.run(300.0)
+        device = running.port.devices[0]
+        assert device.snapshot.shown()["hourmeter"] == 9609
+        assert (running.stats.store_up, log_reads(running)) == (False, [])
+        assert 5 <= running.stats.store_errors["unwritable"] <= 6
+        assert "state: is no directory" in caplog.text
+        assert caplog.text.count("event=history_store_failed") == 1
+        obstacle.unlink()
+        await running.until(lambda: running.stats.devices[11].harvests)
+        assert running.stats.store_up
+        assert "event=history_store_restored" in caplog.text
+    assert stored(obstacle) == truth(controller)
+
+
+async def test_a_file_damaged_while_it_is_used_is_replaced_and_filled(
+    tmp_path: Path, gateway: Gateways, clock: VirtualClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    controller = unit(seed=0)
+
+    def damaged(*_arguments: object, **_more: object) -> None:
+        raise HistoryError("corrupt", "database disk image is malformed")
+
+    async with gateway(controller) as running:
+        await running.until(lambda: running.stats.devices[11].harvests)
+        with monkeypatch.context() as patch:
+            patch.setattr(Store, "plan", damaged)
+            clock.now += DAY_S
+            await running.until(lambda: running.stats.store_errors["corrupt"])
+        await running.until(lambda: running.stats.devices[11].harvests == 2)
+        assert running.stats.store_up
+    assert stored(tmp_path) == truth(controller)
+    assert set_aside(tmp_path) == 1
+
+
+async def test_the_dates_follow_a_clock_that_is_set(tmp_path: Path, gateway: Gateways, clock: VirtualClock) -> None:
+    async with gateway(unit(seed=0)) as running:
+        clock.wall_offset -= 5 * DAY_S
+        await running.run(20.0)  # the step is seen before there is anything to move
+        await running.until(lambda: running.stats.devices[11].harvests)
+        before = rows(tmp_path, "SELECT max(written_wall) FROM day")[0][0]
+        clock.wall_offset += 5 * DAY_S
+        await running.run(20.0)
+        assert rows(tmp_path, "SELECT max(written_wall) FROM day")[0][0] == pytest.approx(before + 5 * DAY_S)
+        at = rows(tmp_path, "SELECT look_wall FROM controller")[0][0]
+        assert at == pytest.approx(clock.wall(), abs=120)
+
+
+async def test_the_sleep_of_the_machine_is_no_step_of_the_clock(
+    tmp_path: Path, gateway: Gateways, clock: VirtualClock
+) -> None:
+    running = gateway(unit(seed=0))
+    slept = 0.0
+    running.keeper._awake_s = lambda: clock.now + slept
+    async with running:
+        await running.until(lambda: running.stats.devices[11].harvests)
+        before = rows(tmp_path, "SELECT hourmeter, written_wall FROM day")
+        slept = 7200.0
+        clock.wall_offset += slept
+        await running.run(20.0)
+        assert rows(tmp_path, "SELECT hourmeter, written_wall FROM day") == before
+
+
+def set_aside(directory: Path) -> int:
+    return len(list(directory.glob("*.corrupt-*")))
+
+
+def spoil_hourmeter(controller: SimulatedController, slot: int, hours: int) -> None:
+    controller.memory.store(Space.REGISTERS, LAYOUT.first + 16 * slot, hours >> 16, hours & 0xFFFF)
+
+
+async def test_days_behind_a_wrong_hourmeter_are_found_all_the_same(
+    tmp_path: Path, gateway: Gateways, clock: VirtualClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    controller = unit(seed=0)
+    async with gateway(controller) as running:
+        await running.until(lambda: running.stats.devices[11].harvests)
+        newest = decode_log(LAYOUT, ring_of(controller)).days[-1].slot
+        clock.now += 4 * DAY_S
+        controller.advance(clock.now)
+        spoil_hourmeter(controller, (newest + 1) % 256, 5)
+        await running.until(lambda: running.stats.devices[11].apart == 1)
+        assert running.stats.devices[11].days == 256 + 3
+    assert "event=history_block_apart" in caplog.text
+    assert rows(tmp_path, "SELECT slot, hourmeter, why FROM apart") == [((newest + 1) % 256, 5, "order")]
+
+
+async def test_two_controllers_on_a_line_have_a_history_each(tmp_path: Path, gateway: Gateways) -> None:
+    one, two = unit(seed=0), unit(seed=2, address=2)
+    async with gateway(one, two, live_s=10.0) as running:
+        await running.until(lambda: all(stats.harvests for stats in running.stats.devices.values()))
+        assert {unit_id: stats.days for unit_id, stats in running.stats.devices.items()} == {11: 256, 12: 37}
+    assert stored(tmp_path, "array-1") == truth(one)
+    assert stored(tmp_path, "array-2") == truth(two)
+
+
+async def test_what_is_stored_is_known_again_after_a_restart(
+    tmp_path: Path, gateway: Gateways, clock: VirtualClock
+) -> None:
+    controller = unit(seed=0)
+    async with gateway(controller) as running:
+        await running.until(lambda: running.stats.devices[11].harvests)
+    clock.now += 3600
+    running = gateway(Silent(MAP, seed=0))
+    async with running:
+        await running.run(60.0)
+        stats = running.stats.devices[11]
+        assert (stats.days, stats.harvests) == (256, 0)
+        assert stats.harvested_at is not None
+        assert clock.now - stats.harvested_at == pytest.approx(3660, abs=60)
+
+
+class Silent(SimulatedController):
+    def hears(self, now: float) -> bool:
+        return False

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from ipaddress import ip_network
 from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
 
+from gateway.core.ratelimit import ClientRate, LineRates
 from gateway.errors import ConfigError
-from gateway.faces.modbus.settings import LineListen
+from gateway.faces.modbus.admission import rate_of
+from gateway.faces.modbus.settings import LineListen, ModbusSettings
 from gateway.service.config import Config, load_config, parse_config
 from gateway.service.problems import Problem, in_file_order, render_path
 from gateway.service.schema import Key, Table
@@ -124,7 +127,8 @@ def test_the_full_example_shows_the_defaults() -> None:
     full, minimal = load_config(CONFIGS / "full.toml"), load_config(CONFIGS / "minimal.toml")
     assert full.poll.model_copy(update={"night_s": None}) == minimal.poll  # TOML cannot show "as by day"
     assert full.cache == minimal.cache
-    assert full.modbus.model_copy(update={"listener": (), "write": ()}) == minimal.modbus
+    rate = full.modbus.rate.model_copy(update={"network": ()})
+    assert full.modbus.model_copy(update={"listener": (), "write": (), "rate": rate}) == minimal.modbus
     assert full.http == minimal.http
     assert full.state_dir == minimal.state_dir
     shown = set(type(full.line[0]).model_fields) - {"name", "port", "device"}
@@ -449,3 +453,36 @@ def test_a_listener_stands_for_one_line() -> None:
 def test_a_listener_that_cannot_be(text: str, problem: str) -> None:
     (found,) = problems(MINIMAL + text)
     assert found.startswith(problem)
+
+
+def test_rates_reach_the_face() -> None:
+    text = """
+[modbus]
+max_per_client = 3
+priority = ["10.9.0.0/16"]
+[modbus.rate]
+requests_per_s = 7.0
+client_line_per_s = 6.0
+device_per_s = 5.0
+line_per_s = 4.0
+burst_s = 3.0
+[[modbus.rate.network]]
+source = ["10.1.0.0/16", "::1/128"]
+requests_per_s = 0.0
+client_line_per_s = 9.0
+"""
+    settings = modbus_settings(parse_config(MINIMAL + text))
+    assert settings.max_per_client == 3
+    assert settings.priority == (ip_network("10.9.0.0/16"),)
+    rate = settings.rate
+    assert (rate.client, rate.lines, rate.burst_s) == (ClientRate(7.0, 6.0), LineRates(5.0, 4.0), 3.0)
+    assert rate_of("10.1.2.3", rate) == rate_of("::1", rate) == ClientRate(0.0, 9.0)
+    assert rate_of("127.0.0.1", rate) == ClientRate(0.0, 6.0)
+    assert rate_of("10.2.2.3", rate) == ClientRate(7.0, 6.0)
+
+
+def test_the_defaults_of_the_file_are_those_of_the_face() -> None:
+    settings, defaults = modbus_settings(parse_config(MINIMAL)), ModbusSettings()
+    assert settings.rate == defaults.rate
+    assert settings.max_per_client == defaults.max_per_client
+    assert settings.priority == defaults.priority

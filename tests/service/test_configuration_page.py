@@ -21,6 +21,8 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "`[poll]`": schema.PollTable,
     "`[cache]`": schema.CacheTable,
     "`[modbus]`": schema.ModbusTable,
+    "`[modbus.rate]`": schema.RateTable,
+    "`[[modbus.rate.network]]`": schema.ClientNetworkTable,
     "`[[modbus.listener]]`": schema.ListenerTable,
     "`[[modbus.write]]`": schema.WriteTable,
     "`[snmp]`": schema.SnmpTable,

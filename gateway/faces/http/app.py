@@ -1,5 +1,6 @@
-"""The HTTP face: `/metrics`, `/sd`, `/healthz`, `/readyz` and a page from memory, `/api/v1/log` from the history.
+"""The HTTP face: everything from memory but `/api/v1/log`, which is from the history.
 
+`/metrics`, `/sd` and `/api/v1/clients` for programs, a page for people, `/healthz` and `/readyz` for supervisors.
 Nothing here reads a line or waits for one, whatever is asked. `/healthz` answers as long as the loop runs;
 `/readyz` says whether the configuration is served as it stands, and is not about the controllers: one that
 is dead is seen in `/metrics`.
@@ -8,15 +9,17 @@ is dead is seen in `/metrics`.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from aiohttp import hdrs, web
 
 from gateway.clock import Clock
+from gateway.core.clients import Client
 from gateway.core.daylog import DayLog
 from gateway.core.site import Site
 from gateway.core.stats import HistoryStats, ModbusServerStats
 from gateway.faces.http import api
+from gateway.faces.http import clients as client_list
 from gateway.faces.http.access import Access, guard
 from gateway.faces.http.api import LogApi
 from gateway.faces.http.discovery import targets
@@ -39,7 +42,8 @@ class HttpFace:
     """Metrics and health of one gateway.
 
     `modbus` and `snmp` are the counters of the other faces; `not_ready` gives the reasons why the gateway
-    is not ready, none when it is; `history` and `log` are there where a history is kept.
+    is not ready, none when it is; `history` and `log` are there where a history is kept; `clients` are those
+    of the Modbus TCP face at any moment.
     """
 
     def __init__(
@@ -53,13 +57,15 @@ class HttpFace:
         not_ready: Callable[[], Sequence[str]],
         history: HistoryStats | None = None,
         log: DayLog | None = None,
+        clients: Iterable[Client] = (),
     ) -> None:
         self._site = site
         self._clock = clock
         self._not_ready = not_ready
         self.stats = HttpStats()
         self._settings = settings
-        self._exposition = Exposition(site, clock, Counts(modbus, snmp, self.stats, not_ready, history))
+        self._exposition = Exposition(site, clock, Counts(modbus, snmp, self.stats, not_ready, history, clients))
+        self._clients = clients
         self._log_api = LogApi(site, log, settings.send_timeout_s)
         self.listeners: Sequence[HttpListener] = tuple(
             HttpListener(host, port, self._application, settings, self.stats) for host, port in settings.listen
@@ -74,6 +80,7 @@ class HttpFace:
         application.router.add_get("/healthz", self._healthz)
         application.router.add_get("/readyz", self._readyz)
         application.router.add_get(api.PATH, self._log_api.handle)
+        application.router.add_get(client_list.PATH, self._who_asks)
         return application
 
     async def _metrics(self, request: web.Request) -> web.StreamResponse:
@@ -106,6 +113,10 @@ class HttpFace:
         assert request.transport is not None
         host, port, *_ = request.transport.get_extra_info("sockname")
         found = targets(self._site.name, request.host, (host, port), secure=request.secure)
+        return web.json_response(found, headers=_NO_STORE)
+
+    async def _who_asks(self, _request: web.Request) -> web.Response:
+        found = client_list.clients_document(self._clients, self._clock.monotonic())
         return web.json_response(found, headers=_NO_STORE)
 
     def _count_refused(self) -> None:

@@ -7,13 +7,15 @@ counters in memory; nothing here waits.
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from gateway import __version__
 from gateway.clock import Clock
+from gateway.core.clients import Client
 from gateway.core.site import Site
 from gateway.core.stats import HistoryStats, ModbusServerStats
+from gateway.faces.http.clients import CLIENT_RULES, client_sources
 from gateway.faces.http.devices import DEVICE_LABELS, device_labels
 from gateway.faces.http.history import DEVICE_HISTORY_RULES, STORE_RULES, DeviceHistoryView
 from gateway.faces.http.lines import DEVICE_RULES, LINE_LABELS, LINE_RULES, LineView
@@ -82,6 +84,14 @@ MODBUS_RULES: tuple[Rule[ModbusServerStats], ...] = (
         lambda stats: stats.refused,
     ),
     each(
+        gateway_counter(
+            "modbus_rate_limited",
+            "Modbus TCP requests refused for a rate limit, by whose: client, client_line, device or line.",
+            "limit",
+        ),
+        lambda stats: stats.limited,
+    ),
+    each(
         gateway_counter("modbus_writes", "Single writes that a rule allowed, by what became of them.", "outcome"),
         lambda stats: stats.writes,
     ),
@@ -124,6 +134,7 @@ OWN_METRICS: tuple[MetricInfo, ...] = tuple(
         LINE_RULES,
         DEVICE_RULES,
         MODBUS_RULES,
+        CLIENT_RULES,
         SNMP_RULES,
         HTTP_RULES,
         STORE_RULES,
@@ -151,6 +162,7 @@ class Counts:
     http: HttpStats = field(default_factory=HttpStats)
     not_ready: Callable[[], Sequence[str]] = _no_reasons
     history: HistoryStats | None = None  # None: no history is kept
+    clients: Iterable[Client] = ()
 
 
 class OwnMetrics:
@@ -170,6 +182,7 @@ class OwnMetrics:
         yield from families(LINE_RULES, lines)
         yield from families(DEVICE_RULES, self._devices)
         yield from families(MODBUS_RULES, [Source(counts.modbus)])
+        yield from families(CLIENT_RULES, client_sources(counts.clients, now))
         yield from families(SNMP_RULES, [Source(counts.snmp())])
         yield from families(HTTP_RULES, [Source(counts.http)])
         if counts.history is not None:

@@ -180,6 +180,7 @@ class ModbusServer:
         now = self._now()
         self.clients.settle()
         for connection in tuple(self._connections):
+            connection.client.last_seen = max(connection.client.last_seen, connection.seen)
             reason = connection.overdue(now)
             if reason is not None:
                 logger.info("event=connection_ended peer=%s reason=%s", connection.peer, reason)

@@ -1,15 +1,15 @@
-"""GET and GETNEXT of one cell, answered without being taken apart again.
+"""GET and GETNEXT of one cell, answered without being taken apart.
 
-A request is its beginning up to the octets of the request id, that id, and a tail: error status, error index and the
-one name. Rules:
+A request is its beginning up to the octets of the request id, that id, and a tail: error status, error index and a list
+of one name with NULL. Rules:
 
-1. A beginning is known when a request with it was read whole and answered: it fixes version, community or scope, kind
-   and, by its lengths, the size of the tail. A tail is known when a request with it was read whole: it names one cell.
-2. Beginning and tail are compared octet by octet with what is known, so a request made of a known beginning and a
-   known tail of the right size is as well-formed as those two were.
+1. A beginning is known when a request with it was read whole and answered. It fixes version, community or scope, kind
+   and, by its lengths, the size of the tail; and so every octet of the tail but those of the name.
+2. All these octets are compared, and the name has to be that of a cell of the window, so what is answered here is as
+   well-formed as what was read whole.
 3. Nothing of the reply is kept: the varbind is the cell's own, as it is now. Whatever is not a plain value (end of the
    view, no such instance) is left to the long way.
-4. Tails are kept in the window, at most one a cell; beginnings are few, and bounded by MOST_BEGINNINGS.
+4. Beginnings are few, and bounded by MOST_BEGINNINGS.
 """
 
 from __future__ import annotations
@@ -19,21 +19,26 @@ from gateway.faces.snmp.reader import Request
 from gateway.faces.snmp.tree import Window
 
 MOST_BEGINNINGS = 512
+MOST_TAIL = 0x87
+"""Octets of a tail whose lengths still take one octet each."""
+
 _RESULT = b"\x02\x01\x00\x02\x01\x00"
+_NULL = b"\x05\x00"
 
 
 class Single:
     """A known beginning; `head` is what stands before the PDU in a message with a community, None for a bare PDU."""
 
-    __slots__ = ("_envelopes", "_head", "_id_size", "_next", "grant", "room", "tail_size", "window")
+    __slots__ = ("_envelopes", "_frame", "_head", "_id_size", "_next", "_size", "grant", "room", "window")
 
     def __init__(
-        self, window: Window, request: Request, tail_size: int, *, room: int, head: bytes | None, grant: object
+        self, window: Window, request: Request, size: int, *, room: int, head: bytes | None, grant: object
     ) -> None:
         self.window = window
         self.grant = grant
         self.room = room
-        self.tail_size = tail_size
+        self._size = size  # of the tail
+        self._frame = _RESULT + wire.head(0x30, size - 8) + wire.head(0x30, size - 10)
         self._head = head
         self._next = request.kind == reader.GET_NEXT
         self._id_size = len(request.request_id) - 2
@@ -42,8 +47,10 @@ class Single:
     def reply(self, request_id: bytes, tail: bytes, now: float) -> bytes | None:
         """The reply, None when it takes the long way; `request_id` are the octets of it."""
         window = self.window
-        place = window.tails.get(tail)
-        if place is None or len(tail) != self.tail_size:
+        if len(tail) != self._size or tail[:10] != self._frame or tail[-2:] != _NULL:
+            return None
+        place = window.places.get(tail[10:-2])
+        if place is None:
             return None
         if self._next:
             place += 1
@@ -85,17 +92,13 @@ class Singles:
     def learn(
         self, data: bytes, request: Request, window: Window, *, room: int, head: bytes | None, grant: object
     ) -> None:
-        """Learn from a request that ends with `data` and was answered in `window`."""
-        if request.kind == reader.GET_BULK or len(request.names) != 1 or not request.id_at:
+        """Learn from a GET or GETNEXT of one name that ends with `data` and was answered in `window`."""
+        size = len(data) - request.id_at - len(request.request_id) + 2
+        if size > MOST_TAIL:
             return
-        place = window.places.get(request.names[0])
-        if place is None:
-            return
-        at = request.id_at + len(request.request_id) - 2
-        window.tails[data[at:]] = place
         beginning = data[: request.id_at]
         known = self.known.get(beginning)
         if known is None or known.grant is not grant or known.window is not window or known.room != room:
             if len(self.known) >= MOST_BEGINNINGS:
                 del self.known[next(iter(self.known))]
-            self.known[beginning] = Single(window, request, len(data) - at, room=room, head=head, grant=grant)
+            self.known[beginning] = Single(window, request, size, room=room, head=head, grant=grant)

@@ -105,7 +105,6 @@ class Window:
         self.slots = tuple(slots)
         self._oids = [slot.oid for slot in slots]
         self.places = {slot.name: place for place, slot in enumerate(slots)}  # by encoded OID
-        self.tails: dict[bytes, int] = {}  # known tails of requests for one cell, and its place (singles.py)
         self._objects = objects
         self._depths = sorted({len(oid) for oid in objects})
         self._devices = devices

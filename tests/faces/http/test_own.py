@@ -9,6 +9,8 @@ from collections.abc import Iterator
 import pytest
 
 from gateway import __version__
+from gateway.core.clients import ClientTable
+from gateway.core.ratelimit import ClientRate
 from gateway.core.site import LineState, Site
 from gateway.core.stats import DeviceHistoryStats, HistoryStats, ModbusServerStats
 from gateway.faces.http.exposition import Exposition
@@ -97,14 +99,16 @@ def test_version_and_start(site: Site, clock: ManualClock) -> None:
 def test_what_is_collected_is_what_is_described(site: Site, clock: ManualClock) -> None:
     modbus = ModbusServerStats()
     modbus.exceptions[2] = 1
-    for reasons in (modbus.malformed, modbus.refused, modbus.writes, modbus.closed):
+    for reasons in (modbus.malformed, modbus.refused, modbus.limited, modbus.writes, modbus.closed):
         reasons["because"] = 1
     line, device = site.lines[0], site.devices[0]
     line.stats.seconds_by_client["10.0.0.1"] = 1.0
     device.stats.refresh_s = 1.0
     of_device = DeviceHistoryStats(2, Counter(refused=1), days=256, apart=1, harvested_at=clock.now)
     history = HistoryStats({11: of_device}, store_up=True, store_errors=Counter(full=1))
-    exposition = Exposition(site, clock, Counts(modbus, lambda: {"get": 1}, history=history))
+    clients = ClientTable(modbus, burst_s=2.0)
+    clients.arrived("10.0.0.1", ClientRate(), clock.now).exceptions[2] = 1
+    exposition = Exposition(site, clock, Counts(modbus, lambda: {"get": 1}, history=history, clients=clients))
 
     def collected() -> Iterator[tuple[str, str, str, set[str]]]:
         for family in parse(scrape(exposition)):

@@ -1,0 +1,152 @@
+"""`clients` against a gateway that runs as its user runs it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from threading import Thread
+
+import pytest
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+from gateway.clock import SystemClock
+from gateway.service.config import load_config
+from gateway.service.gateway import Gateway
+
+CONFIG = """
+site = "ridge-07"
+state_dir = "{folder}"
+[history]
+enabled = false
+[[line]]
+name = "shelter-a"
+port = "/nonexistent/a"
+[[line.device]]
+name = "array-1"
+address = 1
+unit_id = 11
+model = "prostar-mppt"
+[modbus]
+listen = ["127.0.0.1:{modbus}"]
+[http]
+listen = ["127.0.0.1:{http}"]
+{more}
+"""
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port: int = probe.getsockname()[1]
+        return port
+
+
+class Running:
+    """A gateway on a loop of its own, in a thread."""
+
+    def __init__(self, folder: Path, more: str = "") -> None:
+        self.modbus = free_port()
+        self.config = folder / "gateway.toml"
+        self.config.write_text(CONFIG.format(folder=folder, modbus=self.modbus, http=free_port(), more=more))
+        self._loop = asyncio.new_event_loop()
+        self._stop = asyncio.Event()
+        self._gateway = Gateway(load_config(self.config), SystemClock())
+        self._thread = Thread(target=self._run)
+
+    def start(self) -> None:
+        self._thread.start()
+        asyncio.run_coroutine_threadsafe(self._ready(), self._loop).result(10)
+
+    def stop(self) -> None:
+        self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(10)
+        assert not self._thread.is_alive()
+
+    def _run(self) -> None:
+        self._loop.run_until_complete(self._gateway.run(self._stop))
+        self._loop.run_until_complete(self._loop.shutdown_default_executor())
+        self._loop.close()
+
+    async def _ready(self) -> None:
+        async with asyncio.timeout(10):
+            while self._gateway.not_ready():  # noqa: ASYNC110 - readiness is polled by everybody
+                await asyncio.sleep(0.01)
+
+
+@pytest.fixture
+def running(tmp_path: Path) -> Iterator[Running]:
+    gateway = Running(tmp_path)
+    gateway.start()
+    yield gateway
+    gateway.stop()
+
+
+def run(*arguments: str) -> tuple[int, str, str]:
+    result = CliRunner(env={"COLUMNS": "120", "NO_COLOR": "1"}).invoke(app, ["clients", *arguments])
+    return result.exit_code, result.stdout, result.stderr
+
+
+def ask(port: int, count: int) -> None:
+    with socket.create_connection(("127.0.0.1", port), 10, ("127.0.0.7", 0)) as client:
+        for _ in range(count):
+            client.sendall(bytes.fromhex("0001 0000 0006 63 03 0000 0001"))
+            assert client.recv(100) == bytes.fromhex("0001 0000 0003 63 83 0a")
+
+
+def test_nobody_so_far_then_who_asked(running: Running) -> None:
+    status, shown, said = run("-c", str(running.config))
+    assert (status, said) == (0, "")
+    assert "nobody so far" in shown
+    ask(running.modbus, 3)
+    status, shown, _ = run("-c", str(running.config))
+    assert status == 0
+    [row] = [row.split() for row in shown.splitlines() if "127.0.0.7" in row]
+    assert row[0] == "127.0.0.7"
+    assert row[-5:] == ["3", "0.0%", "0", "0", "0A:3"]
+
+
+def test_json_is_what_the_gateway_says(running: Running) -> None:
+    ask(running.modbus, 2)
+    status, shown, _ = run("-c", str(running.config), "--json")
+    assert status == 0
+    [client] = json.loads(shown)["clients"]
+    assert (client["client"], client["requests"], client["exceptions"]) == ("127.0.0.7", 2, {"0A": 2})
+
+
+def test_it_shows_the_token_of_the_configuration(tmp_path: Path) -> None:
+    token = tmp_path / "token"
+    token.write_text("0123456789abcdef\n")
+    gateway = Running(tmp_path, more=f'bearer_token_file = "{token}"')
+    gateway.start()
+    try:
+        status, shown, _ = run("-c", str(gateway.config))
+        assert status == 0
+        assert "nobody so far" in shown
+        token.write_text("another-token-0123\n")
+        status, _, said = run("-c", str(gateway.config))
+        assert status == 1
+        assert "401" in said
+        assert "another-token" not in said
+    finally:
+        gateway.stop()
+
+
+def test_a_gateway_that_does_not_run_is_named(tmp_path: Path) -> None:
+    gateway = Running(tmp_path)
+    gateway._loop.close()
+    status, shown, said = run("-c", str(gateway.config))
+    assert (status, shown) == (1, "")
+    assert "/api/v1/clients: Connection refused; is the gateway running?" in said
+
+
+def test_without_an_http_face_there_is_nobody_to_ask(tmp_path: Path) -> None:
+    gateway = Running(tmp_path)
+    gateway._loop.close()
+    text = gateway.config.read_text()
+    gateway.config.write_text(text[: text.index("[http]")] + "[http]\nlisten = []\n")
+    status, _, said = run("-c", str(gateway.config))
+    assert status == 1
+    assert "http.listen is empty" in said
