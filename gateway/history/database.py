@@ -122,22 +122,14 @@ def open_for_reading(directory: Path) -> sqlite3.Connection:
     path = directory / FILE_NAME
     if not path.is_file():
         raise HistoryError("missing", f"{path}: there is no history yet")
-    # Without a write-ahead log nobody has it open. SQLite would make one, which a reader may not be able to.
-    still = "" if path.with_name(path.name + "-wal").exists() else "&immutable=1"
-    with explained(path):
-        connection = sqlite3.connect(
-            f"{path.absolute().as_uri()}?mode=ro{still}",
-            uri=True,
-            timeout=BUSY_S,
-            isolation_level=None,
-            check_same_thread=False,  # an export goes through a pool of threads, one at a time
-        )
-        try:
-            _check_kind(connection, path)
-        except BaseException:
-            connection.close()
+    try:
+        return _open_for_reading(path, "mode=ro")
+    except HistoryError as error:
+        # A reader needs the files beside a write-ahead log, and makes them where it may. Where it may not and there
+        # are none, nobody has the history open, and it can be read as it lies.
+        if error.kind != "unwritable" or path.with_name(path.name + "-wal").exists():
             raise
-        return connection
+        return _open_for_reading(path, "mode=ro&immutable=1")
 
 
 def set_aside(path: Path, why: str) -> Path:
@@ -175,6 +167,26 @@ def transaction(connection: sqlite3.Connection) -> Iterator[None]:
             connection.execute("ROLLBACK")
         raise
     connection.execute("COMMIT")
+
+
+def _open_for_reading(path: Path, options: str) -> sqlite3.Connection:
+    with explained(path):
+        connection = sqlite3.connect(
+            f"{path.absolute().as_uri()}?{options}",
+            uri=True,
+            timeout=BUSY_S,
+            isolation_level=None,
+            check_same_thread=False,  # an export goes through a pool of threads, one at a time
+        )
+        try:
+            written = _check_kind(connection, path)
+        except BaseException:
+            connection.close()
+            raise
+    if not written:
+        connection.close()
+        raise HistoryError("missing", f"{path}: there is no history yet")
+    return connection
 
 
 def _open(path: Path) -> sqlite3.Connection:

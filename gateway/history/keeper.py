@@ -35,7 +35,7 @@ from gateway.history.settings import HistorySettings
 from gateway.history.store import Kept, Plan, Store
 
 CLIENT = "history"
-CHECK_S = 10.0
+CHECK_S = 2.0
 CLOCK_STEP_S = 60.0
 
 _AWAY = (DeviceOffline, PathUnavailable, ShuttingDown)

@@ -83,6 +83,9 @@ async def test_the_whole_ring_is_kept_after_the_start(tmp_path: Path, gateway: G
         assert (stats.days, stats.apart, dict(stats.failures)) == (256, 0, {})
         reads = [frame for _, frame in running.port.sent if frame[1] == 3 and frame[2] >= 0x80 and frame[2] < 0xE0]
         assert len(reads) == 37  # seven blocks a read
+        line = running.port.stats
+        assert line.seconds_by_client.keys() == {"history"}
+        assert line.seconds_by_purpose["background"] > 9
     assert rows(tmp_path, "SELECT DISTINCT word_order FROM day") == [(order.value,)]
     fields = json.loads(rows(tmp_path, "SELECT fields FROM day ORDER BY hourmeter DESC LIMIT 1")[0][0])
     day = decode_log(LAYOUT, ring_of(controller)).days[-1]

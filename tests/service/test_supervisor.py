@@ -137,6 +137,17 @@ async def test_a_line_that_ran_for_long_starts_again_quickly() -> None:
     assert time.slept == [0.5, 0.5, 0.5]
 
 
+async def test_a_keeper_is_restarted_like_a_line_under_its_own_name() -> None:
+    time = Time()
+    line, keeper = FakeLine(time, 1), FakeLine(time, 2)
+    supervisor = Supervisor(time, [line], [], [keeper], sleep=time.sleep)
+    async with running(supervisor):
+        await line.running.wait()
+        await keeper.running.wait()
+    assert supervisor.restarts == {f"line {line.name}": 1, keeper.name: 2}
+    assert keeper.cancelled
+
+
 async def test_a_bug_in_a_listener_is_counted_and_retried() -> None:
     time = Time()
     listener = FakeListener("x", [ZeroDivisionError()])

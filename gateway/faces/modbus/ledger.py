@@ -99,10 +99,11 @@ class LedgerFile:
             data = _lines(self.book.carried(_latest(self.book)))
             _write_all(fd, data)
             os.fsync(fd)
-            for number in range(self._keep, 1, -1):
-                if self._old(number - 1).exists():
-                    self._old(number - 1).replace(self._old(number))
-            self._path.replace(self._old(1))
+            if self._path.exists():  # it is not when this broke off between the last two renames
+                for number in range(self._keep, 1, -1):
+                    if self._old(number - 1).exists():
+                        self._old(number - 1).replace(self._old(number))
+                self._path.replace(self._old(1))
             self._fresh.replace(self._path)
             self._sync_folder()
         except OSError:
