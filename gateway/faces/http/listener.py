@@ -64,6 +64,7 @@ class HttpListener:
             application,
             access_log=None,
             keepalive_timeout=self._settings.idle_timeout_s,
+            lingering_time=0,  # nobody has anything to send here
             shutdown_timeout=self._settings.stop_grace_s,
         )
         await runner.setup()
