@@ -128,11 +128,12 @@ def _writer(model: DeviceMap, point: Point, metric: str) -> _Writer | None:
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """How the points of one model are written: four columns with one entry a point."""
+    """How the points of one model are written: columns with one entry a point."""
 
     points: tuple[str, ...]
     families: tuple[int, ...]
-    numbers: tuple[tuple[bytes, float], ...]  # how a plain number's line begins, and its scale
+    begins: tuple[bytes, ...]  # how a plain number's line begins
+    scales: tuple[float, ...]  # what a plain number is multiplied by
     writers: tuple[_Writer | None, ...]  # None: it is a plain number
 
 
@@ -157,20 +158,18 @@ class _DeviceLines:
         before = self._written
         if before is None or _status(before) != _status(snapshot):
             lines[: len(DEVICE_METRICS)] = _status_lines(self.labels, snapshot)
-        plan, old = self._plan, self._values
+        plan, closed = self._plan, self._closed
         values = list(map(snapshot.shown().get, plan.points))
+        columns = (values, self._values, plan.families, plan.begins, plan.scales, plan.writers)
         # The one loop that runs for every value of every device: tens of thousands of times a scrape.
-        for index, value in enumerate(values):
-            if value != old[index]:
-                writer = plan.writers[index]
+        for value, old, family, begin, scale, writer in zip(*columns, strict=True):
+            if value != old:
                 if value is None:
-                    line = b""
+                    lines[family] = b""
                 elif writer is None:
-                    begin, scale = plan.numbers[index]
-                    line = begin + self._closed + number(value * scale)
+                    lines[family] = begin + closed + number(value * scale)
                 else:
-                    line = writer.lines(self.labels, value)
-                lines[plan.families[index]] = line
+                    lines[family] = writer.lines(self.labels, value)
         self._values = values
         self._written = snapshot
         self._lines = lines
@@ -221,7 +220,7 @@ class DeviceMetrics:
         ]
 
     def _plan(self, model: DeviceMap) -> _Plan:
-        columns: list[tuple[str, int, tuple[bytes, float], _Writer | None]] = []
+        columns: list[tuple[str, int, bytes, float, _Writer | None]] = []
         for point in model.points:
             info = point_metric(point)
             if info is None:
@@ -231,11 +230,11 @@ class DeviceMetrics:
                 raise MapError(f"{model.model}: point {point.name}: metric {info.name} has other labels elsewhere")
             family = list(self._families).index(info.name)
             begin = f"{info.name}{{".encode()
-            columns.append((point.name, family, (begin, point.metric_scale), _writer(model, point, info.name)))
+            columns.append((point.name, family, begin, point.metric_scale, _writer(model, point, info.name)))
         if not columns:
-            return _Plan((), (), (), ())
-        points, families, numbers, writers = zip(*columns, strict=True)
-        return _Plan(points, families, numbers, writers)
+            return _Plan((), (), (), (), ())
+        points, families, begins, scales, writers = zip(*columns, strict=True)
+        return _Plan(points, families, begins, scales, writers)
 
     def write(self) -> Iterator[Lines]:
         """Each device's lines, written as far as they changed; a step of the iteration is one device."""

@@ -12,11 +12,9 @@ from typing import Generic, TypeVar
 
 from gateway.core.histogram import Histogram
 from gateway.faces.http.metric import Labels, MetricInfo, counter, gauge, histogram
-from gateway.faces.http.text import Lines, label_pairs, sample_lines
+from gateway.faces.http.text import Lines, label_pairs, number, sample_lines
 
 T = TypeVar("T")
-
-_pairs = lru_cache(maxsize=1024)(label_pairs)
 
 Sample = tuple[Labels, float | Histogram]
 """Values of the labels beyond those of the source, and the number."""
@@ -45,17 +43,24 @@ class Rule(Generic[T]):
 
     def lines(self, sources: Sequence[Source[T]]) -> Lines:
         """The samples of all sources."""
-        return [
-            sample_lines(self.metric, self._written(source, extra), value)
-            for source in sources
-            for extra, value in self.read(source.of)
-        ]
+        info = self.metric
+        begin = info.name.encode()
+        lines = []
+        for source in sources:
+            for extra, value in self.read(source.of):
+                labels = _with(source.written, info.labels, extra) if extra else source.written
+                if labels and not isinstance(value, Histogram):  # nearly always
+                    lines.append(begin + b"{" + labels + b"}" + number(value))
+                else:
+                    lines.append(sample_lines(info, labels, value))
+        return lines
 
-    def _written(self, source: Source[T], extra: Labels) -> bytes:
-        if not extra:
-            return source.written
-        more = _pairs(self.metric.labels[-len(extra) :], extra)
-        return source.written + b"," + more if source.written else more
+
+@lru_cache(maxsize=4096)
+def _with(written: bytes, names: Labels, extra: Labels) -> bytes:
+    """The labels of a source and those of its rule, which are the last of `names`."""
+    more = label_pairs(names[-len(extra) :], extra)
+    return written + b"," + more if written else more
 
 
 def one(metric: MetricInfo, pick: Callable[[T], float]) -> Rule[T]:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 from gateway.core.histogram import Histogram
 from gateway.faces.http.metric import MetricInfo, MetricKind
@@ -22,6 +21,7 @@ Lines = Sequence[bytes]
 """Sample lines in pieces, each of whole lines."""
 
 _OPENMETRICS_VERSIONS = ("", "0.0.1", "1.0.0")
+_NUMBERS_KEPT = 16384
 _TEXT_VERSIONS = ("", "0.0.4")
 _WEIGHT = re.compile(r"(?:0(?:\.\d{0,3})?|1(?:\.0{0,3})?)")
 
@@ -87,16 +87,24 @@ def header(info: MetricInfo, form: Format) -> bytes:
     return f"# HELP {info.family} {text}\n# TYPE {info.family} {info.kind}\n{unit}".encode()
 
 
-@lru_cache(maxsize=16384)
-def number(value: float) -> bytes:
-    """A sample's number and the end of its line, so that reading it back gives the same float.
+class _Numbers(dict[float, bytes]):
+    """Number → how it is written; forgets all when it is full."""
 
-    Measured values come from half-precision floats and so repeat a lot, hence the cache.
-    """
-    text = repr(float(value))
-    if text[-1] in "fn":  # inf and nan, which the formats spell in their own way
-        text = {"inf": "+Inf", "-inf": "-Inf"}.get(text, "NaN")
-    return f" {text}\n".encode()
+    def __missing__(self, value: float) -> bytes:
+        if len(self) >= _NUMBERS_KEPT:
+            self.clear()
+        text = repr(value + 0.0)  # a float, and no negative zero
+        if text[-1] in "fn":  # inf and nan, which the formats spell in their own way
+            text = {"inf": "+Inf", "-inf": "-Inf"}.get(text, "NaN")
+        self[value] = line = f" {text}\n".encode()
+        return line
+
+
+number = _Numbers().__getitem__
+"""A sample's number and the end of its line, so that reading it back gives the same float.
+
+Measured values come from half-precision floats and so repeat a lot: most of them are only looked up.
+"""
 
 
 def escaped(value: str) -> str:
