@@ -14,6 +14,7 @@ from gateway.core.budget import LineBudget
 from gateway.service.advice import advice
 from gateway.service.config import Config
 from gateway.service.settings import line_budgets
+from gateway.service.snmp import snmp_on
 
 
 def command(config: ConfigOption) -> None:
@@ -72,4 +73,4 @@ def _at(listen: Sequence[str]) -> str:
 
 
 def _snmp(config: Config) -> str:
-    return _at(config.snmp.listen) if config.snmp.community else "off (no community)"
+    return _at(config.snmp.listen) if snmp_on(config) else "off (no community, no user)"

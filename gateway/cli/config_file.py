@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 
@@ -21,8 +22,13 @@ def load_or_exit(path: Path) -> Config:
     try:
         return load_config(path)
     except ConfigError as error:
-        count = len(error.problems)
-        for problem in error.problems:
-            print(problem, file=sys.stderr)
-        print(f"{count} problem{'s' * (count != 1)} in {path}", file=sys.stderr)
-        raise typer.Exit(EX_CONFIG) from None
+        refuse(path, error.problems)
+
+
+def refuse(path: Path, problems: Sequence[str]) -> NoReturn:
+    """Every problem on standard error, and exit status 78."""
+    count = len(problems)
+    for problem in problems:
+        print(problem, file=sys.stderr)
+    print(f"{count} problem{'s' * (count != 1)} in {path}", file=sys.stderr)
+    raise typer.Exit(EX_CONFIG) from None

@@ -6,10 +6,11 @@ from typing import Annotated
 
 import typer
 
-from gateway.cli.config_file import ConfigOption, load_or_exit
+from gateway.cli.config_file import ConfigOption, load_or_exit, refuse
 from gateway.service.gateway import serve
 from gateway.service.logs import Level, set_up_logging
 from gateway.service.loops import Loop, loop_factory
+from gateway.service.snmp import unreadable
 
 
 def command(
@@ -25,4 +26,7 @@ def command(
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--loop") from None
     set_up_logging(log_level)
-    serve(load_or_exit(config), make_loop)
+    checked = load_or_exit(config)
+    if missing := [f"{config}: {text}" for text in unreadable(checked)]:
+        refuse(config, missing)
+    serve(checked, make_loop)

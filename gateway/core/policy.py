@@ -45,6 +45,7 @@ class Reason(StrEnum):
     WRITE_NOT_ALLOWED = "write_not_allowed"
     WRITE_VALUE = "write_value"
     UNKNOWN_FUNCTION = "unknown_function"
+    ROLE_REQUIRED = "role_required"
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +64,7 @@ _WRITE_FUNCTION = Decision(allowed=False, reason=Reason.WRITE_FUNCTION)
 _WRITE_NOT_ALLOWED = Decision(allowed=False, reason=Reason.WRITE_NOT_ALLOWED)
 _WRITE_VALUE = Decision(allowed=False, reason=Reason.WRITE_VALUE)
 _UNKNOWN = Decision(allowed=False, reason=Reason.UNKNOWN_FUNCTION)
+ROLE_REQUIRED = Decision(allowed=False, reason=Reason.ROLE_REQUIRED)
 
 
 def decide(
@@ -120,18 +122,22 @@ class Audit:
         self._budget = LogBudget()
         self._often = LogBudget()
 
-    def record(self, decision: Decision, peer: str, unit: int, pdu: bytes, now: float) -> str | None:
+    def record(
+        self, decision: Decision, peer: str, unit: int, pdu: bytes, now: float, *, role: str | None = None
+    ) -> str | None:
         """Count a refusal; returns the log line that it is worth, or None."""
         self._refused[decision.reason] += 1
         if decision.reason is Reason.UNKNOWN_FUNCTION:
             return None
         at = 5 if pdu[0] == _READ_WRITE_MULTIPLE else 1  # function 17 names the range that it reads first
         address = f"0x{pdu[at]:02x}{pdu[at + 1]:02x}" if len(pdu) >= at + 2 else "none"
-        left_out = self._budget.spend((peer, unit, pdu[0], address, decision.reason), now)
+        left_out = self._budget.spend((peer, role, unit, pdu[0], address, decision.reason), now)
         if left_out is None:
             return None
+        event = "request_refused" if decision.reason is Reason.ROLE_REQUIRED else "write_refused"
+        who = peer if role is None else f'{peer} role="{role}"'
         return (
-            f"event=write_refused peer={peer} unit={unit} function=0x{pdu[0]:02x} address={address}"
+            f"event={event} peer={who} unit={unit} function=0x{pdu[0]:02x} address={address}"
             f" reason={decision.reason} left_out={left_out}"
         )
 

@@ -49,6 +49,17 @@ class DeviceStats:
 
 
 @dataclass(slots=True)
+class TlsStats:
+    """Modbus/TCP Security since start."""
+
+    handshakes: int = 0  # that let a client in
+    refused: Counter[str] = field(default_factory=Counter)  # reason → failed handshakes
+    reload_failures: int = 0
+    problem: str = ""  # why the files on disk are not those in use; "" when they are
+    not_after: float | None = None  # Unix time when the server's certificate expires; None: there is none yet
+
+
+@dataclass(slots=True)
 class ModbusServerStats:
     """The Modbus TCP face since start."""
 
@@ -64,6 +75,7 @@ class ModbusServerStats:
     limited: Counter[str] = field(default_factory=Counter)  # whose rate limit was met → requests
     writes: Counter[str] = field(default_factory=Counter)  # what became of single writes that were allowed → count
     closed: Counter[str] = field(default_factory=Counter)  # why the server ended a connection → count
+    tls: TlsStats | None = None  # None: there is no TLS listener
 
 
 @dataclass(slots=True)

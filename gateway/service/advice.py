@@ -11,6 +11,7 @@ from pathlib import Path
 
 from gateway.core.budget import LineBudget
 from gateway.service.schema import DOCUMENTATION_ROOT, Config, LineTable, parse_listen, parse_root
+from gateway.service.snmp import snmp_advice, snmp_on
 from gateway.service.writes import write_advice
 
 SATURATED = 0.95
@@ -76,12 +77,13 @@ def _snmp(config: Config) -> Iterator[str]:
     snmp = config.snmp
     if not snmp.listen:
         return
-    if not snmp.community:
-        yield "snmp.community: there is none, so nobody can read by SNMP and the port is not opened"
+    if not snmp_on(config):
+        yield "snmp.community, snmp.user: there is none, so nobody can read by SNMP and the port is not opened"
         return
+    yield from snmp_advice(config)
     if parse_root(snmp.enterprise_root)[: len(DOCUMENTATION_ROOT)] == DOCUMENTATION_ROOT:
         yield "snmp.enterprise_root: 32473 is the number for documentation; use your own enterprise number in service"
-    for path, text in _named("snmp.listen", _beyond_loopback(snmp.listen)):
+    for path, text in _named("snmp.listen", _beyond_loopback(snmp.listen) if snmp.community else ()):
         yield f"{path}: {text} can be reached from other machines, and SNMP v2c sends the community in clear"
     for index, community in enumerate(snmp.community):
         networks = [ipaddress.ip_network(source) for source in community.source]

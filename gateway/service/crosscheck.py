@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from gateway.devices.schema import load_map, models
 from gateway.service.problems import Path, Problem, render_path, show, table_at
 from gateway.service.schema import NOT_SUPPORTED, Address, parse_listen
+from gateway.service.snmp import snmp_problems
 from gateway.service.writes import rule_problems
 
 Raw = Mapping[str, object]
@@ -35,8 +36,11 @@ def cross_problems(raw: Raw) -> list[Problem]:
         problems += _model(path, device)
     problems += _pair(raw, "http", "tls_certificate", "tls_private_key")
     snmp = _table(raw, "snmp")
-    communities = _tables(snmp, "community", ("snmp",))
+    communities, users, views = (list(_tables(snmp, key, ("snmp",))) for key in ("community", "user", "view"))
     problems += _repeated((((*path, "name"), table.get("name")) for path, table in communities), secret=True)
+    problems += _repeated(((*path, "name"), table.get("name")) for path, table in users)
+    problems += _repeated(((*path, "name"), table.get("name")) for path, table in views)
+    problems += snmp_problems(users, communities, views)
     problems += _line_listeners(raw, [line.get("name") for _, line in lines])
     problems += _listen_clashes(raw, ("modbus", "http"))
     problems += _listen_clashes(raw, ("snmp",))

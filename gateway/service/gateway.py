@@ -33,8 +33,8 @@ from gateway.service.settings import (
     line_devices,
     line_settings,
     modbus_settings,
-    snmp_settings,
 )
+from gateway.service.snmp import snmp_settings
 from gateway.service.supervisor import Listener, Supervisor
 
 _log = logging.getLogger(__name__)

@@ -1,7 +1,7 @@
 """The configuration file as classes: every key, its type, range, default and what it is for.
 
-Rule 1: a key exists only here. Problem texts, config/full.toml, docs/configuration.md and the suggestions for
-misspelt keys are checked against (or made from) these classes.
+Rule 1: a key exists only here, those of SNMP in service/schema_snmp.py. Problem texts, config/full.toml,
+docs/configuration.md and the suggestions for misspelt keys are checked against (or made from) these classes.
 Rule 2: a class checks one value at a time. Whatever compares two keys lives in service/crosscheck.py, which
 works on the raw file, so that both kinds of problem are reported together.
 Rule 3: a key that this version cannot honour is not here; `UNSUPPORTED` says so by name.
@@ -9,107 +9,81 @@ Rule 3: a key that this version cannot honour is not here; `UNSUPPORTED` says so
 
 from __future__ import annotations
 
-import ipaddress
-import re
-from dataclasses import dataclass
 from typing import Annotated, Literal
 from urllib.parse import urlsplit
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field
 
 from gateway.core.ratelimit import ClientRate, LineRates
 from gateway.core.settings import LineSettings, PollSettings
 from gateway.core.write_wear import WearLimits
+from gateway.service.keys import (
+    A_FILE,
+    A_NAME,
+    DOCUMENTATION_ROOT,
+    LISTENS,
+    LOOPBACK,
+    NETWORKS,
+    RANGES,
+    AbsolutePath,
+    Address,
+    Hours,
+    Key,
+    Listens,
+    Name,
+    Networks,
+    Ranges,
+    Rate,
+    Seconds,
+    Table,
+    parse_listen,
+    parse_range,
+    parse_root,
+)
+from gateway.service.schema_snmp import CommunityTable, SnmpTable, UserTable, ViewTable
 
-MORNINGSTAR_ROOT = (1, 3, 6, 1, 4, 1, 33333)
-DOCUMENTATION_ROOT = (1, 3, 6, 1, 4, 1, 32473)
+__all__ = [
+    "DOCUMENTATION_ROOT",
+    "NOT_SUPPORTED",
+    "UNSUPPORTED",
+    "Address",
+    "CacheTable",
+    "ClientNetworkTable",
+    "CommunityTable",
+    "Config",
+    "DeviceTable",
+    "HistoryTable",
+    "HttpTable",
+    "Key",
+    "LineTable",
+    "ListenerTable",
+    "ModbusTable",
+    "PollTable",
+    "RateTable",
+    "SnmpTable",
+    "Table",
+    "UserTable",
+    "ViewTable",
+    "WriteTable",
+    "parse_listen",
+    "parse_range",
+    "parse_root",
+]
+
 PORT_SCHEMES = ("rfc2217", "socket")
 NOT_SUPPORTED = "not supported in this version"
 
 UNSUPPORTED = {
-    ("snmp", "user"): f"SNMPv3 users are {NOT_SUPPORTED}; allowed: [[snmp.community]]",
     ("snmp", "notify"): f"traps and informs are {NOT_SUPPORTED}; allowed: leave the table out",
 }
 """Keys of later versions, by their path without list positions, with what to tell the reader."""
 
-
-@dataclass(frozen=True, slots=True)
-class Key:
-    """What a reader is told about a key: what is allowed, and what the key does."""
-
-    allowed: str
-    does: str
-    secret: bool = False  # its value never appears in a problem text
-
-
-@dataclass(frozen=True, slots=True)
-class Address:
-    """An IP address and a port to listen on; port 0 takes any free one."""
-
-    host: str
-    port: int
-
-    def __str__(self) -> str:
-        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
-
-    @property
-    def loopback(self) -> bool:
-        """Whether only this machine can reach it."""
-        return ipaddress.ip_address(self.host).is_loopback
-
-
-def parse_listen(text: str) -> Address:
-    """The address of `127.0.0.1:1502` or `[::1]:1502`; ValueError for anything else, names included."""
-    host, colon, port = text.rpartition(":")
-    if host.startswith("[") and host.endswith("]"):
-        ip: ipaddress.IPv4Address | ipaddress.IPv6Address = ipaddress.IPv6Address(host[1:-1])
-    else:
-        ip = ipaddress.IPv4Address(host)
-    if not colon or not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:
-        raise ValueError("no port")
-    return Address(str(ip), int(port))
-
-
-def parse_range(text: str) -> tuple[int, int]:
-    """First and last address of `0xE000-0xE005` or `0x0001`; ValueError for anything else."""
-    found = re.fullmatch(r"0x([0-9A-Fa-f]{1,4})(?:-0x([0-9A-Fa-f]{1,4}))?", text)
-    if found is None:
-        raise ValueError("no range of addresses")
-    first = int(found[1], 16)
-    last = first if found[2] is None else int(found[2], 16)
-    if last < first:
-        raise ValueError("the last address is before the first")
-    return first, last
-
-
-def parse_root(text: str) -> tuple[int, ...]:
-    """The numbers of a dotted OID below 1.3.6.1.4.1; ValueError otherwise."""
-    if not re.fullmatch(r"1\.3\.6\.1\.4\.1(\.(0|[1-9][0-9]{0,9})){1,20}", text):
-        raise ValueError("not an OID below 1.3.6.1.4.1")
-    root = tuple(int(part) for part in text.split("."))
-    if max(root) > 0xFFFF_FFFF:
-        raise ValueError("a number is above 4294967295")
-    if root[:7] == MORNINGSTAR_ROOT:
-        raise ValueError("33333 belongs to Morningstar")
-    return root
-
-
-def _listen(text: str) -> str:
-    return str(parse_listen(text))
-
-
-def _network(text: str) -> str:
-    return str(ipaddress.ip_network(text))
-
-
-def _range(text: str) -> str:
-    parse_range(text)
-    return text
-
-
-def _root(text: str) -> str:
-    parse_root(text)
-    return text
+_LINE = LineSettings(name="", index=1, port="")
+_POLL = PollSettings()
+_CLIENT_RATE = ClientRate()
+_LINE_RATES = LineRates()
+_RATE = "0.0 to 1000000.0 a second; 0.0 is no limit"
+_WEAR = WearLimits()
 
 
 def _port(text: str) -> str:
@@ -125,43 +99,10 @@ def _port(text: str) -> str:
     return text
 
 
-Name = Annotated[str, Field(pattern=r"^[^\s\x00-\x1f\x7f]([^\x00-\x1f\x7f]{0,62}[^\s\x00-\x1f\x7f])?$")]
-Text = Annotated[str, Field(pattern=r"^[ -~]{0,255}$")]
-Listen = Annotated[str, AfterValidator(_listen)]
-Network = Annotated[str, AfterValidator(_network)]
-Seconds = Annotated[float, Field(allow_inf_nan=False)]
-Hours = Annotated[float, Field(allow_inf_nan=False)]
-Rate = Annotated[float, Field(allow_inf_nan=False)]
-Listens = Annotated[tuple[Listen, ...], Field(strict=False)]
-AbsolutePath = Annotated[str, Field(pattern=r"^(/[^\x00-\x1f]*)?$")]
-Networks = Annotated[tuple[Network, ...], Field(strict=False)]
-Ranges = Annotated[tuple[Annotated[str, AfterValidator(_range)], ...], Field(strict=False)]
-
-_NAME = "1 to 64 printable characters, no blank at either end"
-_TEXT = "up to 255 printable ASCII characters"
-_LISTEN = 'a list of "IPv4:port" or "[IPv6]:port" such as "127.0.0.1:1502"; [] turns the face off'
-_NETWORK = 'a list of addresses or networks such as "127.0.0.0/8", "10.1.2.3" or "::1/128"'
-_FILE = 'the absolute path of a file, or "" for none'
-_RANGES = 'a list of PDU addresses or ranges of them such as "0xE000-0xE005" or "0x0001"'
-_LOOPBACK = ("127.0.0.0/8", "::1/128")
-_LINE = LineSettings(name="", index=1, port="")
-_POLL = PollSettings()
-_CLIENT_RATE = ClientRate()
-_LINE_RATES = LineRates()
-_RATE = "0.0 to 1000000.0 a second; 0.0 is no limit"
-_WEAR = WearLimits()
-
-
-class Table(BaseModel):
-    """A table of the file: unknown keys are refused, nothing is converted, nothing can be changed."""
-
-    model_config = ConfigDict(strict=True, extra="forbid", frozen=True)
-
-
 class DeviceTable(Table):
     """`[[line.device]]`: a controller on the line."""
 
-    name: Annotated[Name, Key(_NAME, "What the controller is called on every face; unique in the gateway.")]
+    name: Annotated[Name, Key(A_NAME, "What the controller is called on every face; unique in the gateway.")]
     address: Annotated[int, Key("1 to 247", "Its Modbus address on the line; factory setting 1.")] = Field(ge=1, le=247)
     unit_id: Annotated[
         int,
@@ -198,7 +139,7 @@ class DeviceTable(Table):
 class LineTable(Table):
     """`[[line]]`: a serial port and the controllers on it."""
 
-    name: Annotated[Name, Key(_NAME, "What the line is called on every face; unique.")]
+    name: Annotated[Name, Key(A_NAME, "What the line is called on every face; unique.")]
     port: Annotated[
         Annotated[str, AfterValidator(_port)],
         Key(
@@ -286,7 +227,7 @@ class ListenerTable(Table):
 class WriteTable(Table):
     """`[[modbus.write]]`: who may write what; a request is allowed when rules allow all of it."""
 
-    source: Annotated[Networks, Key(_NETWORK + ", at least one", "Who may write.")] = Field(min_length=1)
+    source: Annotated[Networks, Key(NETWORKS + ", at least one", "Who may write.")] = Field(min_length=1)
     unit_id: Annotated[
         Annotated[tuple[Annotated[int, Field(ge=1, le=247)], ...], Field(strict=False)],
         Key("a list of unit ids of the file", "On which controllers; left out: on all."),
@@ -297,15 +238,15 @@ class WriteTable(Table):
     ] = ()
     registers: Annotated[
         Ranges,
-        Key(_RANGES, "Further registers, without those that must be named."),
+        Key(RANGES, "Further registers, without those that must be named."),
     ] = ()
-    coils: Annotated[Ranges, Key(_RANGES, "Further coils, without those that must be named.")] = ()
+    coils: Annotated[Ranges, Key(RANGES, "Further coils, without those that must be named.")] = ()
 
 
 class ClientNetworkTable(Table):
     """`[[modbus.rate.network]]`: other rates for some clients; the first table that names an address decides."""
 
-    source: Annotated[Networks, Key(_NETWORK + ", at least one", "For whom.")] = Field(min_length=1)
+    source: Annotated[Networks, Key(NETWORKS + ", at least one", "For whom.")] = Field(min_length=1)
     requests_per_s: Annotated[Rate, Key(_RATE, "As in [modbus.rate].")] = Field(
         default=_CLIENT_RATE.requests_per_s, ge=0.0, le=1e6
     )
@@ -346,7 +287,7 @@ class RateTable(Table):
 class ModbusTable(Table):
     """`[modbus]`: the Modbus TCP face."""
 
-    listen: Annotated[Listens, Key(_LISTEN, "Where Modbus TCP clients connect.")] = ("127.0.0.1:1502",)
+    listen: Annotated[Listens, Key(LISTENS, "Where Modbus TCP clients connect.")] = ("127.0.0.1:1502",)
     max_connections: Annotated[
         int,
         Key("1 to 1024", "How many clients may be connected at once, over all listen addresses."),
@@ -357,9 +298,9 @@ class ModbusTable(Table):
     ] = Field(default=64, ge=1, le=1024)
     priority: Annotated[
         Networks,
-        Key(_NETWORK, "Clients that always get in: over a limit, a connection without priority makes room."),
+        Key(NETWORKS, "Clients that always get in: over a limit, a connection without priority makes room."),
     ] = ()
-    allow: Annotated[Networks, Key(_NETWORK, "Who may connect; others are closed before a byte is read.")] = _LOOPBACK
+    allow: Annotated[Networks, Key(NETWORKS, "Who may connect; others are closed before a byte is read.")] = LOOPBACK
     strict_map: Annotated[
         bool,
         Key("true or false", "Answer 02 for ranges outside of the map without asking the controller."),
@@ -396,54 +337,25 @@ class ModbusTable(Table):
     ] = ()
 
 
-class CommunityTable(Table):
-    """`[[snmp.community]]`: who may read by SNMP v2c; none by default."""
-
-    name: Annotated[
-        Annotated[str, Field(pattern=r"^[!-~]{1,32}$", repr=False)],
-        Key("1 to 32 printable ASCII characters without blanks", "The community name.", secret=True),
-    ]
-    source: Annotated[Networks, Key(_NETWORK + ", at least one", "From where it may be used.")] = Field(min_length=1)
-
-
-class SnmpTable(Table):
-    """`[snmp]`: the SNMP face; its port is opened only when there is a community."""
-
-    listen: Annotated[Listens, Key(_LISTEN, "Where the SNMP agent answers (UDP).")] = ("127.0.0.1:1161",)
-    enterprise_root: Annotated[
-        Annotated[str, AfterValidator(_root)],
-        Key(
-            'an OID of yours below 1.3.6.1.4.1, such as "1.3.6.1.4.1.32473.1"; never 33333, which is Morningstar\'s',
-            "Where the MIB hangs; 32473 is for documentation, use your own enterprise number in service.",
-        ),
-    ] = "1.3.6.1.4.1.32473.1"
-    contact: Annotated[Text, Key(_TEXT, "sysContact: whom to call.")] = ""
-    location: Annotated[Text, Key(_TEXT, "sysLocation: where the gateway is.")] = ""
-    community: Annotated[
-        Annotated[tuple[CommunityTable, ...], Field(strict=False)],
-        Key("[[snmp.community]] tables", "Who may read; without one nobody can."),
-    ] = ()
-
-
 class HttpTable(Table):
     """`[http]`: /metrics, /sd, /healthz and /readyz."""
 
-    listen: Annotated[Listens, Key(_LISTEN, "Where Prometheus scrapes and health checks ask.")] = ("127.0.0.1:9850",)
+    listen: Annotated[Listens, Key(LISTENS, "Where Prometheus scrapes and health checks ask.")] = ("127.0.0.1:9850",)
     basic_auth_file: Annotated[
         AbsolutePath,
-        Key(_FILE, "Names and passwords of who may ask, one name:password a line; /healthz stays open."),
+        Key(A_FILE, "Names and passwords of who may ask, one name:password a line; /healthz stays open."),
     ] = ""
     bearer_token_file: Annotated[
         AbsolutePath,
-        Key(_FILE, "A token of 16 printable ASCII characters or more; who shows it may ask."),
+        Key(A_FILE, "A token of 16 printable ASCII characters or more; who shows it may ask."),
     ] = ""
     tls_certificate: Annotated[
         AbsolutePath,
-        Key(_FILE, "The certificate (PEM, with its chain) of HTTPS; needs tls_private_key."),
+        Key(A_FILE, "The certificate (PEM, with its chain) of HTTPS; needs tls_private_key."),
     ] = ""
-    tls_private_key: Annotated[AbsolutePath, Key(_FILE, "The certificate's private key (PEM, without a password).")] = (
-        ""
-    )
+    tls_private_key: Annotated[
+        AbsolutePath, Key(A_FILE, "The certificate's private key (PEM, without a password).")
+    ] = ""
 
 
 class HistoryTable(Table):
@@ -465,7 +377,7 @@ class HistoryTable(Table):
 class Config(Table):
     """The whole file."""
 
-    site: Annotated[Name, Key(_NAME, "The site's name, shown on every face.")]
+    site: Annotated[Name, Key(A_NAME, "The site's name, shown on every face.")]
     state_dir: Annotated[
         Annotated[str, Field(pattern=r"^/")],
         Key("an absolute path", "Where the gateway keeps what must outlive it, such as the write ledger."),

@@ -13,9 +13,8 @@ from gateway.core.site import Device
 from gateway.devices.schema import load_map
 from gateway.faces.http.settings import HttpSettings
 from gateway.faces.modbus.settings import LineListen, ModbusSettings, Network, RateSettings
-from gateway.faces.snmp.settings import Community, SnmpSettings
 from gateway.history.settings import HistorySettings
-from gateway.service.schema import Config, LineTable, RateTable, parse_listen, parse_root
+from gateway.service.schema import Config, LineTable, RateTable, parse_listen
 from gateway.service.writes import line_writes, write_rules, write_settings
 
 Pairs = tuple[tuple[str, int], ...]
@@ -95,21 +94,6 @@ def modbus_settings(config: Config) -> ModbusSettings:
         strict_map=modbus.strict_map,
         reply_timeout_s=deadline_s - WATCH_S,
         stop_grace_s=STOP_GRACE_S,
-    )
-
-
-def snmp_settings(config: Config) -> SnmpSettings:
-    """The settings of the SNMP face; without a community nothing listens, for nobody could be answered."""
-    snmp = config.snmp
-    return SnmpSettings(
-        listen=_pairs(snmp.listen) if snmp.community else (),
-        communities=tuple(
-            Community(community.name, tuple(ipaddress.ip_network(source) for source in community.source))
-            for community in snmp.community
-        ),
-        enterprise_root=parse_root(snmp.enterprise_root),
-        contact=snmp.contact,
-        location=snmp.location,
     )
 
 

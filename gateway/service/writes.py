@@ -86,7 +86,7 @@ def write_advice(config: Config) -> Iterator[str]:
 
 def _rule(table: WriteTable) -> WriteRule:
     return WriteRule(
-        sources=tuple(ipaddress.ip_network(source) for source in table.source),
+        sources=tuple(ipaddress.ip_network(source) for source in table.source) or None,
         unit_ids=frozenset(table.unit_id) or None,
         points=frozenset(table.point),
         registers=tuple(Range(*parse_range(text)) for text in table.registers),

@@ -68,7 +68,7 @@ def test_check_config_warns_of_a_line_that_is_too_busy(tmp_path: Path) -> None:
     assert status == 0
     assert "[bold]" in shown  # a name is not markup
     assert "warning line[0]: polling would take 21" in shown
-    assert "SNMP off (no community)" in shown
+    assert "SNMP off (no community, no user)" in shown
 
 
 @pytest.mark.parametrize("command", ["run", "check-config"])

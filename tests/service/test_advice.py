@@ -31,7 +31,10 @@ def test_a_file_that_is_as_it_should_be_needs_none() -> None:
     ("text", "expected"),
     [
         (HEAD + LINE + COMMUNITY, "snmp.enterprise_root: 32473 is the number for documentation"),
-        (HEAD + LINE, "snmp.community: there is none, so nobody can read by SNMP and the port is not opened"),
+        (
+            HEAD + LINE,
+            "snmp.community, snmp.user: there is none, so nobody can read by SNMP and the port is not opened",
+        ),
         (CLEAN.replace("/dev/serial/by-id/usb-a", "/dev/ttyUSB0"), "line[0].port: /dev/ttyUSB0 may be another adapter"),
         (CLEAN.replace("/dev/serial/by-id/usb-a", "/dev/ttyACM0"), "line[0].port: /dev/ttyACM0 may be another adapter"),
         (

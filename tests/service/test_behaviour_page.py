@@ -1,4 +1,4 @@
-"""docs/behaviour.md: every row names a test that exists, and its numbers are the code's."""
+"""docs/behaviour.md: every row names a test that exists, as docs/writes.md does, and its numbers are the code's."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gateway.service.settings import STOP_GRACE_S
 
 PAGE = Path(__file__).parents[2] / "docs" / "behaviour.md"
 TEXT = PAGE.read_text()
-NAMED = re.findall(r'\[test\]\((\S+) "(\w+)"\)', TEXT)
+NAMED = re.findall(r'\[test\]\((\S+) "(\w+)"\)', TEXT + (PAGE.parent / "writes.md").read_text())
 MODBUS, HTTP = ModbusSettings(), HttpSettings()
 
 

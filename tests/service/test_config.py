@@ -195,7 +195,8 @@ listen = ["127.0.0.1:70000"]
         "modbus.writes",
         "snmp.enterprise_root",
         "snmp.community[0].source",
-        "snmp.user",
+        "snmp.user[0].auth_password_file",
+        "snmp.user[0].priv_password_file",
         "http.listen[0]",
         "site",
     ]
@@ -256,8 +257,8 @@ listen = ["127.0.0.1:70000"]
             'modbus.allow[0]: "nas" is not allowed; allowed: a list of addresses',
         ),
         (
-            MINIMAL + "[snmp]\nuser = []\n",
-            "snmp.user: SNMPv3 users are not supported in this version; allowed: [[snmp.",
+            MINIMAL + '[[snmp.community]]\nname = "a"\nsource = ["::1"]\nview = "x"\n',
+            'snmp.community[0].view: there is no view "x"; allowed: none',
         ),
         (
             MINIMAL + '[[snmp.notify]]\nkind = "trap"\n',

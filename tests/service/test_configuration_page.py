@@ -27,6 +27,8 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "`[[modbus.write]]`": schema.WriteTable,
     "`[snmp]`": schema.SnmpTable,
     "`[[snmp.community]]`": schema.CommunityTable,
+    "`[[snmp.user]]`": schema.UserTable,
+    "`[[snmp.view]]`": schema.ViewTable,
     "`[http]`": schema.HttpTable,
     "`[history]`": schema.HistoryTable,
 }

@@ -23,8 +23,8 @@ from gateway.service.settings import (
     line_devices,
     line_settings,
     modbus_settings,
-    snmp_settings,
 )
+from gateway.service.snmp import snmp_settings
 
 TEXT = """
 site = "ridge-07"

@@ -95,6 +95,7 @@ class Connection(asyncio.Protocol):
         self._partial_since: float | None = None
         self.peer = ""  # the client's address, by which it is counted and has its share of a line
         self.client = NOBODY
+        self.role: str | None = None  # that of the client's certificate
         self.seen = 0.0  # monotonic time of the last request
 
     # What asyncio calls
@@ -173,6 +174,13 @@ class Connection(asyncio.Protocol):
         self._left(self)
 
     # What the server calls
+
+    def identified(self, role: str | None, dispatcher: Dispatcher | None = None) -> None:
+        """Serve the client by this role, and in another way than was foreseen; called before its first request."""
+        self.role = role
+        if dispatcher is not None:
+            self._dispatcher = dispatcher
+            self._find = dispatcher.hot.find
 
     @property
     def idle(self) -> bool:
@@ -330,7 +338,7 @@ class Connection(asyncio.Protocol):
     def _take(self, adu: Adu, now: float, out: list[bytes]) -> None:
         """Answer one request, or ask for its answer; what may leave now is put into `out`."""
         tid = adu.tid.to_bytes(2)
-        answer = self._dispatcher.answer(adu.unit, adu.pdu, self.client, now)
+        answer = self._dispatcher.answer(adu.unit, adu.pdu, self.client, now, self.role)
         if isinstance(answer, bytes) and not self._due:
             out.append(tid)
             out.append(answer)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from gateway.clock import Clock
 from gateway.core.clients import Client
-from gateway.core.policy import Audit, Reason, Refusal, decide
+from gateway.core.policy import ROLE_REQUIRED, Audit, Reason, Refusal, decide
 from gateway.core.ratelimit import CLIENT, CLIENT_LINE, LineLimiter
 from gateway.core.serving import Ask, FromMemory, Serving
 from gateway.core.site import Device, Outcome, Site, Ticket
@@ -115,14 +115,18 @@ class Shared:
 
 
 class Dispatcher:
-    """The requests of one way in. Replies are ADUs without their transaction id."""
+    """The requests of one way in. Replies are ADUs without their transaction id.
 
-    def __init__(self, routes: Mapping[int, Serving], clock: Clock, shared: Shared) -> None:
+    `barred`: it is the way of those who have no right at all (R-23); each request is refused with 01.
+    """
+
+    def __init__(self, routes: Mapping[int, Serving], clock: Clock, shared: Shared, *, barred: bool = False) -> None:
         self.hot = HotReplies()  # its keys hold the unit id, which means another device on another way in
         self.stats = shared.stats
         self.now = clock.monotonic
         self._audit = shared.audit
         self._routes = routes
+        self._barred = barred
         self._limiter = shared.limiter
         self._writer = shared.writer
 
@@ -132,7 +136,6 @@ class Dispatcher:
         A client that asks more than it may has its `pause_s` set.
         """
         self.stats.requests += 1
-        peer = client.name
         if not client.lease(now):
             client.unpaid += 1
             return self.refuse(unit, pdu, client, self._limited(client, CLIENT, now))
@@ -144,18 +147,17 @@ class Dispatcher:
             self.stats.cache_hits += 1
             return entry[3]
         try:
-            serving = self._routes.get(unit)
-            if serving is None:
-                raise UnitNotRouted
-            writer, requester = self._writer, Requester(peer, role)
+            requester = Requester(client.name, role)
+            serving = self._route(unit, pdu, requester, now)
+            writer = self._writer
             rules = None if writer is None else writer.rules(serving.device)
             decision = decide(pdu[0], serving.functions, rules, requester)
             if not decision.allowed:
-                raise self._refused(Refusal(decision, IllegalFunction()), peer, unit, pdu, now)
+                raise self._refused(Refusal(decision, IllegalFunction()), requester, unit, pdu, now)
             if decision.reason is Reason.WRITE and writer is not None:
                 planned = writer.plan(serving.device, requester, pdu)
                 if isinstance(planned, Refusal):
-                    raise self._refused(planned, peer, unit, pdu, now)
+                    raise self._refused(planned, requester, unit, pdu, now)
                 if not planned.slave_control:  # which nobody's flood of the line may hold back
                     self._check_rate(client, serving.device, now)
                 self._forwarded(client)
@@ -188,8 +190,16 @@ class Dispatcher:
             client.exceptions[outcome[1]] += 1
         return mbap.encode(0, waiting.unit, outcome)[2:]
 
-    def _refused(self, refusal: Refusal, peer: str, unit: int, pdu: bytes, now: float) -> RequestError:
-        line = self._audit.record(refusal.decision, peer, unit, pdu, now)
+    def _route(self, unit: int, pdu: bytes, requester: Requester, now: float) -> Serving:
+        if self._barred:
+            raise self._refused(Refusal(ROLE_REQUIRED, IllegalFunction()), requester, unit, pdu, now)
+        serving = self._routes.get(unit)
+        if serving is None:
+            raise UnitNotRouted
+        return serving
+
+    def _refused(self, refusal: Refusal, requester: Requester, unit: int, pdu: bytes, now: float) -> RequestError:
+        line = self._audit.record(refusal.decision, requester.address, unit, pdu, now, role=requester.role)
         if line is not None:
             logger.warning("%s", line)
         return refusal.error

@@ -23,8 +23,8 @@ from gateway.core.log_budget import LogBudget
 from gateway.core.policy import Audit
 from gateway.core.ratelimit import LineLimiter
 from gateway.core.site import Site
-from gateway.core.stats import ModbusServerStats
-from gateway.errors import ListenError
+from gateway.core.stats import ModbusServerStats, TlsStats
+from gateway.errors import ListenError, TlsFilesError
 from gateway.faces.modbus.accepting import Acceptor, listening_socket
 from gateway.faces.modbus.admission import decide, rate_of
 from gateway.faces.modbus.connection import Connection
@@ -32,24 +32,36 @@ from gateway.faces.modbus.dispatch import Dispatcher, Routes, Shared
 from gateway.faces.modbus.settings import ModbusSettings
 from gateway.faces.modbus.sockets import Hub, SocketTransport
 from gateway.faces.modbus.tcp import bind_problem
+from gateway.faces.modbus.tls import TlsDoor
 from gateway.faces.modbus.writer import Writer
 
 logger = logging.getLogger(__name__)
 
 
 class Listener:
-    """One listening address and the connections that came through it."""
+    """One listening address and the connections that came through it; with a `door`, through TLS."""
 
-    def __init__(self, server: ModbusServer, dispatcher: Dispatcher, host: str, port: int, line: str = "") -> None:
+    def __init__(
+        self,
+        server: ModbusServer,
+        dispatcher: Dispatcher,
+        host: str,
+        port: int,
+        *,
+        line: str = "",
+        door: TlsDoor | None = None,
+    ) -> None:
         self._server = server
         self._dispatcher = dispatcher
+        self._door = door
         self._host = host
         self._port = port
         self._acceptor: Acceptor | None = None
         self._connections: set[Connection] = set()
         self._empty = asyncio.Event()
         shown = f"[{host}]" if ":" in host else host
-        self.label = f"modbus {shown}:{port} line {line}" if line else f"modbus {shown}:{port}"
+        face = "modbus" if door is None else "modbus tls"
+        self.label = f"{face} {shown}:{port} line {line}" if line else f"{face} {shown}:{port}"
 
     @property
     def bound(self) -> tuple[str, int] | None:
@@ -64,7 +76,11 @@ class Listener:
         if self._acceptor is not None:
             return
         try:
+            if self._door is not None:
+                self._door.open()
             sock = await listening_socket(self._host, self._port)
+        except TlsFilesError as error:
+            raise ListenError(f"{self.label}: {error}") from error
         except OSError as error:
             raise ListenError(f"{self.label}: {bind_problem(error)}") from error
         self._acceptor = Acceptor(self._server.hub, sock, self.label, self._accepted)
@@ -95,7 +111,8 @@ class Listener:
     def _accepted(self, sock: socket.socket, peername: object) -> None:
         server = self._server
         connection = Connection(self._dispatcher, server.settings, partial(server.admit, self), self.left)
-        SocketTransport(server.hub, sock, peername, connection)
+        protocol = connection if self._door is None else self._door.session(connection)
+        SocketTransport(server.hub, sock, peername, protocol)
 
     def joined(self, connection: Connection) -> None:
         """A connection was let in."""
@@ -125,7 +142,14 @@ class ModbusServer:
         listeners = [Listener(self, self.dispatcher, host, port) for host, port in settings.listen]
         for group in settings.lines:
             dispatcher = Dispatcher(routes.of_line(group.line), clock, shared)
-            listeners += [Listener(self, dispatcher, host, port, group.line) for host, port in group.listen]
+            listeners += [Listener(self, dispatcher, host, port, line=group.line) for host, port in group.listen]
+        self.door: TlsDoor | None = None
+        if settings.tls is not None:
+            stats.tls = TlsStats()
+            barred = Dispatcher({}, clock, shared, barred=True)
+            door = TlsDoor(settings.tls, barred, clock, stats.tls, frame_timeout_s=settings.frame_timeout_s)
+            listeners += [Listener(self, self.dispatcher, host, port, door=door) for host, port in settings.tls.listen]
+            self.door = door
         self.listeners: Sequence[Listener] = tuple(listeners)
         self._stats = stats
         self._now = clock.monotonic

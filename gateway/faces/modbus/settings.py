@@ -9,6 +9,7 @@ from pathlib import Path
 from gateway.core.ratelimit import ClientRate, LineRates
 from gateway.core.write_rules import WriteRule
 from gateway.core.write_wear import WearLimits
+from gateway.faces.modbus.tls_files import TlsFiles
 
 Network = IPv4Network | IPv6Network
 
@@ -51,6 +52,16 @@ class WriteSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class TlsSettings:
+    """Modbus/TCP Security: where, by which files, and what a certificate without a role is good for."""
+
+    listen: tuple[tuple[str, int], ...]
+    files: TlsFiles
+    require_role: bool = True  # False: who has no role may read
+    handshake_timeout_s: float = 5.0
+
+
+@dataclass(frozen=True, slots=True)
 class ModbusSettings:
     """Who may connect, how many, and for how long the server waits for what."""
 
@@ -64,6 +75,7 @@ class ModbusSettings:
     allow: tuple[Network, ...] = LOOPBACK
     max_age_s: float = 5.0  # `[cache] max_age_s`: older is never served from memory
     writes: WriteSettings | None = None  # None: every write is refused
+    tls: TlsSettings | None = None  # None: no TLS
     strict_map: bool = False  # True: exception 02 outside of the map without asking the device
     idle_timeout_s: float = 600.0  # no request for so long: the connection is closed
     frame_timeout_s: float = 5.0  # a request must be complete so long after its first byte

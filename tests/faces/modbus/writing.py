@@ -14,6 +14,7 @@ from ipaddress import ip_network
 from pathlib import Path
 from typing import Any
 
+from gateway.core.ratelimit import ClientRate, LineRates
 from gateway.core.site import Device, LineState, LineStatus, Outcome, Site
 from gateway.core.snapshot import Block, DeviceState, Snapshot
 from gateway.core.stats import LineStats, ModbusServerStats
@@ -25,12 +26,13 @@ from gateway.devices.schema import load_map
 from gateway.errors import ReplyTimeout
 from gateway.faces.modbus.ledger import NAME, read_ledger
 from gateway.faces.modbus.server import ModbusServer
-from gateway.faces.modbus.settings import ModbusSettings, WriteSettings
+from gateway.faces.modbus.settings import ModbusSettings, RateSettings, WriteSettings
 from gateway.modbus import mbap
 from gateway.modbus.pdu import ReadRequest
 from gateway.simulator.device import SimulatedController
 
 MAP = load_map("prostar-mppt")
+NO_LIMITS = RateSettings(ClientRate(0.0, 0.0), LineRates(0.0, 0.0), networks=())
 SETTINGS = (Range(0xE000, 0xE04F),)
 ALL_COILS = (Range(0, 0xFF),)
 RULE = WriteRule(
@@ -200,12 +202,12 @@ class Writing:
         return self.line.units[unit].read(Space.REGISTERS, address, 1, 1000.0)[0]
 
     def poll(self) -> None:
-        """Put RAM and settings into the snapshot, as the line's polls would."""
+        """Put RAM, settings and coils into the snapshot, as the line's polls would."""
         blocks = []
-        for first, count in ((0, 0x52), (0xE000, 0x50)):
-            reply = self.line.units[1].handle(ReadRequest(3, first, count).encode(), 1000.0)
+        for function, first, count in ((3, 0, 0x52), (3, 0xE000, 0x50), (1, 0, 3)):
+            reply = self.line.units[1].handle(ReadRequest(function, first, count).encode(), 1000.0)
             assert reply is not None
-            blocks.append(Block(Space.REGISTERS, first, count, reply[2:], self.clock.now))
+            blocks.append(Block(MAP.functions[function], first, count, reply[2:], self.clock.now))
         self.device.snapshot = replace(self.device.snapshot, blocks=tuple(blocks))
 
     async def close(self) -> None:
@@ -222,6 +224,7 @@ async def writing(
     per_day: int = 10,
     interval_s: float = 0.0,
     on: bool = True,
+    rate: RateSettings = NO_LIMITS,
     line: ControllerLine | None = None,
 ) -> AsyncIterator[Writing]:
     """A face on a free port with one client; units 11 and 12 are addresses 1 and 2 of one line, both online."""
@@ -235,7 +238,7 @@ async def writing(
         device.line = line
     site = Site.of("ridge-07", [line], devices)
     writes = WriteSettings(rules or (RULE,), folder, WearLimits(per_day, interval_s)) if on else None
-    settings = ModbusSettings(listen=(("127.0.0.1", 0),), writes=writes, stop_grace_s=0.05)
+    settings = ModbusSettings(listen=(("127.0.0.1", 0),), writes=writes, stop_grace_s=0.05, rate=rate)
     made = Writing(folder, clock, line, stats, site, ModbusServer(settings, site, clock, stats))
     for listener in made.server.listeners:
         await listener.start()

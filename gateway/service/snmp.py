@@ -1,0 +1,157 @@
+"""SNMP, from the configuration: settings, what is wrong with them, what is worth a second look.
+
+Pass phrases live in files of their own and are read here. One that can be read and must not be used is a problem of
+the configuration; one that cannot be read is advice while the file is checked (another user may be allowed to) and a
+problem when the gateway starts.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path as FilePath
+
+from gateway.errors import ConfigError
+from gateway.faces.snmp.secret import Secret
+from gateway.faces.snmp.settings import EVERYTHING, Community, SnmpSettings, User, View
+from gateway.faces.snmp.usm import MIN_PASS_PHRASE, Auth, Credentials, Priv, fits
+from gateway.service.keys import parse_oid
+from gateway.service.problems import Path, Problem, show
+from gateway.service.schema import Config, UserTable, parse_listen, parse_root
+
+Raw = Mapping[str, object]
+
+MOST_OCTETS = 1024
+"""Of a file with a pass phrase."""
+
+_PASSWORDS = ("auth_password_file", "priv_password_file")
+_AUTH = {each.label: each for each in Auth}
+_PRIV = {each.label: each for each in Priv}
+
+
+def snmp_settings(config: Config) -> SnmpSettings:
+    """The settings of the SNMP face; without a community or user nothing listens, for nobody could be answered.
+
+    Raises ConfigError when a pass phrase cannot be read or must not be used.
+    """
+    snmp = config.snmp
+    views = {"": EVERYTHING} | {
+        view.name: View(tuple(map(parse_oid, view.include)), tuple(map(parse_oid, view.exclude))) for view in snmp.view
+    }
+    return SnmpSettings(
+        listen=tuple((at.host, at.port) for at in map(parse_listen, snmp.listen)) if snmp_on(config) else (),
+        communities=tuple(Community(each.name, _networks(each.source), views[each.view]) for each in snmp.community),
+        users=tuple(
+            User(_credentials(index, user), _networks(user.source), views[user.view])
+            for index, user in enumerate(snmp.user)
+        ),
+        enterprise_root=parse_root(snmp.enterprise_root),
+        contact=snmp.contact,
+        location=snmp.location,
+        v1=snmp.v1,
+        state_dir=FilePath(config.state_dir),
+        renew_engine=snmp.engine_lost == "new",
+        requests_per_s=snmp.requests_per_s,
+    )
+
+
+def snmp_on(config: Config) -> bool:
+    """Whether anybody may read."""
+    return bool(config.snmp.community or config.snmp.user)
+
+
+def snmp_problems(
+    users: Sequence[tuple[Path, Raw]], communities: Sequence[tuple[Path, Raw]], views: Sequence[tuple[Path, Raw]]
+) -> Iterator[Problem]:
+    """What is wrong with these raw tables, beyond the form."""
+    known = [view.get("name") for _, view in views]
+    for path, table in (*communities, *users):
+        name = table.get("view", "")
+        if isinstance(name, str) and name and name not in known:
+            names = ", ".join(show(each) for each in known) or "none"
+            yield Problem((*path, "view"), f"there is no view {show(name)}; allowed: {names}")
+    for path, table in users:
+        yield from _pass_phrases(path, table)
+        auth, priv = _AUTH.get(str(table.get("auth", ""))), _PRIV.get(str(table.get("priv", "")))
+        if auth is not None and priv is not None and not fits(auth, priv):
+            text = f"{show(priv.label)} needs a longer digest than {auth.label}'s"
+            yield Problem((*path, "priv"), f'{text}; allowed: a shorter key, or auth = "SHA-256" or longer')
+
+
+def unreadable(config: Config) -> Iterator[str]:
+    """The pass phrases that cannot be read here and now, by key path."""
+    for index, user in enumerate(config.snmp.user):
+        for key in _PASSWORDS:
+            try:
+                read_pass_phrase(getattr(user, key))
+            except OSError as error:
+                reason = error.strerror or str(error)
+                yield f"snmp.user[{index}].{key}: {getattr(user, key)} cannot be read: {reason}"
+
+
+def snmp_advice(config: Config) -> Iterator[str]:
+    """What an experienced colleague would say about users and their secrets."""
+    for text in unreadable(config):
+        yield f"{text}; the gateway will not start without it"
+    for index, user in enumerate(config.snmp.user):
+        for number, network in enumerate(_networks(user.source)):
+            if network.prefixlen == 0:
+                yield f"snmp.user[{index}].source[{number}]: {network} is everybody"
+        for key in _PASSWORDS:
+            path = pass_phrase_path(getattr(user, key))
+            if path.is_file() and path.stat().st_mode & 0o007:
+                mode = f"{path.stat().st_mode & 0o777:03o}"
+                yield f"snmp.user[{index}].{key}: {path} is open to every user of this machine (mode {mode})"
+
+
+def pass_phrase_path(text: str) -> FilePath:
+    """Where the pass phrase is: a path as it stands, a bare name among systemd's credentials (LoadCredential=)."""
+    if text.startswith("/"):
+        return FilePath(text)
+    return FilePath(os.environ.get("CREDENTIALS_DIRECTORY", "/run/credentials/prostar-gateway.service"), text)
+
+
+def read_pass_phrase(text: str) -> Secret:
+    """The one line of the file. OSError when it cannot be read, ValueError when it is no pass phrase to use."""
+    with pass_phrase_path(text).open("rb") as file:
+        content = file.read(MOST_OCTETS + 1)
+    line = content.removesuffix(b"\n").removesuffix(b"\r")
+    if len(content) > MOST_OCTETS or b"\n" in line:
+        raise ValueError("holds more than one line")
+    if len(line) < MIN_PASS_PHRASE:
+        raise ValueError(f"holds fewer than {MIN_PASS_PHRASE} characters, which is too easily guessed (RFC 3414 §11.2)")
+    return Secret(line)
+
+
+def _pass_phrases(path: Path, table: Raw) -> Iterator[Problem]:
+    for key in _PASSWORDS:
+        text = table.get(key)
+        if not isinstance(text, str) or not text:
+            continue
+        try:
+            read_pass_phrase(text)
+        except OSError:
+            continue
+        except ValueError as error:
+            yield Problem((*path, key), f"{show(text)} {error}; allowed: one line of {MIN_PASS_PHRASE} or more")
+
+
+def _credentials(index: int, user: UserTable) -> Credentials:
+    try:
+        return Credentials(
+            user.name.encode(),
+            _AUTH[user.auth],
+            read_pass_phrase(user.auth_password_file),
+            _PRIV[user.priv],
+            read_pass_phrase(user.priv_password_file),
+        )
+    except OSError as error:
+        reason = f"{error.filename} cannot be read: {error.strerror or error}"
+        raise ConfigError((f"snmp.user[{index}]: {reason}",)) from None
+    except ValueError as error:
+        raise ConfigError((f"snmp.user[{index}]: {error}",)) from None
+
+
+def _networks(texts: Sequence[str]) -> tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]:
+    return tuple(ipaddress.ip_network(text) for text in texts)
