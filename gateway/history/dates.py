@@ -4,8 +4,8 @@ Rule 1: a date is an estimate with an error bound, and both are stored and shown
 Rule 2: the hourmeter counts whole hours in the day and at the look, so an age by it is right to an hour either way.
         To this come the gateway's clock and the drift of the controller's.
 Rule 3: the hourmeter stands still while the controller has no power. A day written between two looks lies between
-        what the first says (counting forward) and what the second says (counting back); half of the distance is
-        added to its bound. For days older than the first look nothing tells of such pauses: their bound holds for
+        the earliest that the first allows (counting forward) and the latest that the second allows (counting back);
+        the middle is taken. For days older than the first look nothing tells of such pauses: their bound holds for
         a controller that always had power, else they are older than stated.
 Rule 4: two looks that are further apart by hourmeter than by the clock mean that the gateway's clock was wrong at
         one of them: the difference is added to the bound.
@@ -50,15 +50,17 @@ def estimate(hourmeter: int, now: Look, before: Look | None = None) -> Estimate 
     """When the day with this hourmeter was written, by the look of now and the last one before it; None: rule 5."""
     if not now.clock_set:
         return None
-    age_s = (now.hours - hourmeter) * HOUR_S
-    latest = now.wall - age_s
-    error_s = HOUR_S + CLOCK_S + DRIFT * abs(age_s)
+    latest = now.wall - (now.hours - hourmeter) * HOUR_S
+    after_s = _error_s(now.hours - hourmeter)
     if before is None or not before.clock_set or hourmeter < before.hours:
-        return Estimate(latest, error_s)
+        return Estimate(latest, after_s)
     earliest = before.wall + (hourmeter - before.hours) * HOUR_S
-    unknown_s = latest - earliest
-    if unknown_s > error_s:  # less is the noise of the whole hours
-        return Estimate((earliest + latest) / 2, error_s + unknown_s / 2)
-    if unknown_s < -error_s:
-        return Estimate(latest, error_s - unknown_s)
-    return Estimate(latest, error_s)
+    if latest < earliest - after_s:
+        return Estimate(latest, after_s + earliest - latest)
+    first, last = earliest - _error_s(hourmeter - before.hours), latest + after_s
+    return Estimate((first + last) / 2, (last - first) / 2)
+
+
+def _error_s(hours: int) -> float:
+    """What an age by the hourmeter is right to, pauses aside."""
+    return HOUR_S + CLOCK_S + DRIFT * abs(hours) * HOUR_S

@@ -119,5 +119,7 @@ def _in_time(known: Known, seen: Seen) -> Known | None:
     if not (known.look.clock_set and seen.look.clock_set):
         return known
     passed_s = seen.look.wall - known.look.wall
+    if passed_s < 0:
+        return known  # the clock was wrong at one of the looks: no evidence
     slack_s = 2 * HOUR_S + CLOCK_S + DRIFT * abs(passed_s)
     return known if (seen.look.hours - known.look.hours) * HOUR_S <= passed_s + slack_s else None

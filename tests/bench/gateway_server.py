@@ -1,7 +1,8 @@
 """The Modbus TCP face over memory: `gateway_server.py PORT asyncio|uvloop`.
 
 Everything of the face is on: routing, policy, freshness, snapshots replaced every second as polls do, access
-list, limits, counters. Only the lines are missing: a read that memory cannot answer is counted as LineDown.
+list, limits, counters, and rate limits, which the load generator would be refused by if they were not set so high.
+Only the lines are missing: a read that memory cannot answer is counted as LineDown.
 Register i of every unit holds i.
 """
 
@@ -13,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from gateway.clock import SystemClock
+from gateway.core.ratelimit import ClientRate
 from gateway.core.site import Device, LineState, LineStatus, Outcome, Site
 from gateway.core.snapshot import Block, DeviceState
 from gateway.core.stats import LineStats, ModbusServerStats
@@ -20,7 +22,7 @@ from gateway.devices.model import Space
 from gateway.devices.schema import load_map
 from gateway.errors import LineDown
 from gateway.faces.modbus.server import ModbusServer
-from gateway.faces.modbus.settings import ModbusSettings
+from gateway.faces.modbus.settings import ModbusSettings, RateSettings
 
 UNITS = 247
 POLL_S = 1.0
@@ -53,7 +55,12 @@ async def serve(port: int) -> None:
     devices = [Device(f"unit-{unit}", unit, unit, load_map("prostar-mppt")) for unit in range(1, UNITS + 1)]
     for device in devices:
         device.line = line
-    settings = ModbusSettings(listen=(("127.0.0.1", port),), max_connections=1024)
+    settings = ModbusSettings(
+        listen=(("127.0.0.1", port),),
+        max_connections=1024,
+        max_per_client=1024,
+        rate=RateSettings(ClientRate(requests_per_s=1e7), networks=()),
+    )
     server = ModbusServer(settings, Site.of("bench", [line], devices), clock, ModbusServerStats())
     data = b"".join(at.to_bytes(2) for at in range(0x52))
     for listener in server.listeners:

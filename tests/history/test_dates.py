@@ -72,3 +72,10 @@ def test_a_clock_that_was_never_set_makes_no_dates() -> None:
     assert not unset.clock_set
     assert estimate(990, unset) is None
     assert estimate(1010, Look(1020, WALL), unset) == estimate(1010, Look(1020, WALL))
+
+
+def test_a_pause_too_short_to_be_seen_is_within_the_bound() -> None:
+    before, now = look_at(1.5), look_at(3.0, off_hours=1.5)  # hourmeters 1 and 3, three hours apart
+    found = estimate(3, now, before)
+    assert found is not None
+    assert abs(found.at - (WALL + 3.0 * HOUR_S)) <= found.error_s

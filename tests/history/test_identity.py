@@ -75,6 +75,7 @@ def test_the_same_log_is_the_same_controller_anywhere_but_not_twice() -> None:
     assert owner([elsewhere], who, RING, {}) is None
 
 
-def test_without_a_clock_growth_is_no_evidence() -> None:
-    who = seen(9999, wall=1000.0)
+@pytest.mark.parametrize("wall", [1000.0, WALL - 3600])
+def test_without_a_right_clock_growth_is_no_evidence(wall: float) -> None:
+    who = seen(9999, wall=wall)
     assert owner([KNOWN], who, read_ring(LAYOUT, full_ring([9000, 9024]), 9999), {}) is KNOWN

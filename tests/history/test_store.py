@@ -122,8 +122,8 @@ def test_days_without_a_clock_are_dated_when_there_is_one(tmp_path: Path, store:
     assert rows(tmp_path, "SELECT max(written_wall) FROM day") == [(WALL - 7 * HOUR_S,)]
 
 
-def dates(directory: Path) -> dict[object, object]:
-    return {row[0]: row[1] for row in rows(directory, "SELECT hourmeter, written_wall FROM day")}
+def dates(directory: Path) -> dict[object, float]:
+    return {row[0]: float(str(row[1])) for row in rows(directory, "SELECT hourmeter, written_wall FROM day")}
 
 
 def test_a_clock_that_is_set_moves_the_dates_of_this_run_only(tmp_path: Path, store: Store) -> None:
@@ -135,9 +135,10 @@ def test_a_clock_that_is_set_moves_the_dates_of_this_run_only(tmp_path: Path, st
         before = dates(tmp_path)
         assert later.shift([kept.controller.key], 5000.0) == 1
         after = dates(tmp_path)
-    assert {hour: at for hour, at in after.items() if at != before[hour]} == {
-        HOURS[-1] + 24: WALL + 19 * HOUR_S + 5000.0
-    }
+    new_hour = HOURS[-1] + 24
+    moved = {hour: at for hour, at in after.items() if at != before[hour]}
+    assert moved == {new_hour: pytest.approx(before[new_hour] + 5000.0)}
+    assert moved[new_hour] == pytest.approx(WALL + 19 * HOUR_S + 5000.0, abs=60)
     assert rows(tmp_path, "SELECT look_wall FROM controller") == [(WALL + 24 * HOUR_S + 5000.0,)]
 
 

@@ -398,7 +398,8 @@ class Connection(asyncio.Protocol):
     def _hold(self, *, waiting: bool) -> None:
         """Know since when something waits to be looked at (rule 3).
 
-        What comes as soon as reading is resumed may have waited in the kernel since it was paused.
+        What comes as soon as reading is resumed may have waited in the kernel since it was paused, and what comes
+        after that for as long. So a client that always has more under way than we take must have a pause some time.
         """
         if not waiting:
             self._held_since = None
@@ -417,7 +418,7 @@ class Connection(asyncio.Protocol):
                 self._partial_since = now  # it was our turn until now
             self._transport.resume_reading()
         else:
-            self._unread_since = now
+            self._unread_since = now if self._held_since is None else self._held_since
             self._transport.pause_reading()
 
     def _guarded(self, step: Callable[[], None]) -> None:

@@ -8,7 +8,7 @@ Rule 1: a transport calls its protocol as asyncio's do: `connection_made`, any `
         never from within a call of the protocol's own.
 Rule 2: what is written goes to the kernel at once. The rest is kept in order; more than the protocol's limit of
         it pauses the protocol.
-Rule 3: nobody has the loop for long: a turn serves `TURN` sockets, and takes `READ_BYTES` from each.
+Rule 3: nobody has the loop for long: a turn serves `TURN` events, and takes `READ_BYTES` from each socket.
 Rule 4: a peer that is gone is noticed also while nothing is read from it.
 """
 
@@ -21,8 +21,8 @@ import socket
 from collections.abc import Callable
 from typing import Any
 
-TURN = 64
-READ_BYTES = 4096
+TURN = 128
+READ_BYTES = 2048
 
 _IN = select.EPOLLIN
 _read = os.read
@@ -72,18 +72,25 @@ class Hub:
         if self._epoll is None:
             return
         takers = self._takers
-        for fd, events in self._epoll.poll(0, TURN):
-            if events == _IN and (take := takers.get(fd)) is not None:
-                try:
-                    data = _read(fd, READ_BYTES)
-                except OSError:
-                    data = b""  # the call below meets it again
-                if data:
-                    take(data)
-                    continue
-            call = self._calls.get(fd)
-            if call is not None:  # None: closed by what another one did in this turn
-                call(events)
+        poll = self._epoll.poll
+        left = TURN
+        while left > 0 and self._epoll is not None:
+            ready = poll(0, left)
+            if not ready:
+                return
+            left -= len(ready)
+            for fd, events in ready:
+                if events == _IN and (take := takers.get(fd)) is not None:
+                    try:
+                        data = _read(fd, READ_BYTES)
+                    except OSError:
+                        data = b""  # the call below meets it again
+                    if data:
+                        take(data)
+                        continue
+                call = self._calls.get(fd)
+                if call is not None:  # None: closed by what another one did in this turn
+                    call(events)
 
 
 class SocketTransport(asyncio.Transport):
