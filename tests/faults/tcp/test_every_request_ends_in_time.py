@@ -117,11 +117,11 @@ async def test_a_deep_pipeline_ends_within_the_printed_deadline(depth: int, dead
     )
     asked_at = line.now
     while line.now < asked_at + 200.0 and transport.closed_at is None and len(transport.replies) < depth:
-        while kernel and transport.reading and transport.closed_at is None:
-            piece, kernel = kernel[:2048], kernel[2048:]
-            connection.data_received(piece)
-        for _ in range(10):
-            line.run(WATCH_S / 10)
+        for _ in range(20):
+            while kernel and transport.reading and transport.closed_at is None:
+                piece, kernel = kernel[:2048], kernel[2048:]
+                connection.data_received(piece)
+            line.run(WATCH_S / 20)
         reason = connection.overdue(line.now)
         if reason is not None and transport.closed_at is None:
             connection.end(reason)
