@@ -60,10 +60,10 @@ def watch(hours: int, live_s: float) -> None:
     rng = Random(85)
     blocks: list[int] = []
     with chaos:
-        for _ in range(4 * hours):
-            live(rig, HOUR_S / 4, rng)
+        for _ in range(12 * hours):
+            live(rig, HOUR_S / 12, rng)
             rig.account()
-            if min(unit.sequence for unit in rig.units) > REMEMBERED:
+            if min(unit.sequence for unit in rig.units) > REMEMBERED + 300:
                 blocks.append(allocated_blocks())
         short, longer = (traced_bytes(rig, seconds, rng) for seconds in (60.0, 240.0))
         chaos.stop()
@@ -95,7 +95,7 @@ def quiet() -> Iterator[None]:
 
 
 def test_an_hour() -> None:
-    watch(hours=1, live_s=1.0)
+    watch(hours=1, live_s=2.0)
 
 
 @pytest.mark.long

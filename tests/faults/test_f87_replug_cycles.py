@@ -60,15 +60,16 @@ async def cycle(line: PtyRig, number: int) -> float:
     return time.monotonic() - begun
 
 
-async def settled(line: PtyRig, before: Held) -> Held:
-    """What is held when everything that ends by itself has ended."""
-    held = before
-    for _ in range(200):
-        gc.collect()
-        held = Held.now()
-        if held == before:
-            break
+async def settled() -> Held:
+    """What is held when everything that ends by itself has ended: the same for a while."""
+    gc.collect()
+    held, since = Held.now(), 0
+    for _ in range(1000):
         await asyncio.sleep(0.01)
+        seen = Held.now()
+        held, since = (held, since + 1) if seen == held else (seen, 0)
+        if since == 20:
+            break
     return held
 
 
@@ -77,9 +78,9 @@ async def cycles(folder: Path, count: int) -> None:
         await line.online()
         for number in range(WARM_UP):
             await cycle(line, number)
-        before = Held.now()
+        before = await settled()
         took_s = [await cycle(line, number) for number in range(count)]
-        assert await settled(line, before) == before
+        assert await settled() == before
         tenth = max(5, count // 10)
         first, last = sorted(took_s[:tenth]), sorted(took_s[-tenth:])
         assert last[len(last) // 2] < 3 * first[len(first) // 2] + 0.05
