@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from typing import Annotated
 
 import typer
@@ -26,6 +27,7 @@ def command(
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--loop") from None
     set_up_logging(log_level)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # a core dump would hold pass phrases and keys
     checked = load_or_exit(config)
     if missing := [f"{config}: {text}" for text in unreadable(checked)]:
         refuse(config, missing)
