@@ -120,8 +120,9 @@ def open_database(directory: Path) -> sqlite3.Connection:
 def open_for_reading(directory: Path) -> sqlite3.Connection:
     """The history of this directory, read only, beside a gateway that writes it; HistoryError when it cannot be."""
     path = directory / FILE_NAME
-    if not path.is_file():
-        raise HistoryError("missing", f"{path}: there is no history yet")
+    with explained(path):
+        if not path.is_file():
+            raise HistoryError("missing", f"{path}: there is no history yet")
     try:
         return _open_for_reading(path, "mode=ro")
     except HistoryError as error:

@@ -25,11 +25,18 @@ class HistorySource:
     async def export(self, form: LogFormat, selection: Selection) -> AsyncGenerator[bytes, None]:
         """See `DayLog.export`."""
         reader = await asyncio.to_thread(HistoryReader, self._directory)
+        pieces = export(reader, form, selection, self._site)
+        reading: asyncio.Task[str | None] | None = None
         try:
-            pieces = export(reader, form, selection, self._site)
-            while (piece := await asyncio.to_thread(next, pieces, None)) is not None:
+            while True:
+                reading = asyncio.create_task(asyncio.to_thread(next, pieces, None))
+                piece = await asyncio.shield(reading)
+                if piece is None:
+                    return
                 yield piece.encode()
         finally:
+            if reading is not None and not reading.done():
+                await asyncio.wait([reading])  # a connection must not be closed under a thread that reads it
             await asyncio.to_thread(reader.close)
 
     def _devices(self) -> frozenset[str]:

@@ -222,6 +222,11 @@ class Store:
             if outcome is None:
                 tied.append(Apart(day.slot, day.hourmeter, day.words, Why.TIE))
         self._date(key, seen.look, look_before)
+        self._db.execute(  # a block that has turned out to be a day
+            "DELETE FROM apart WHERE controller = ? AND EXISTS (SELECT 1 FROM day WHERE day.controller = "
+            "apart.controller AND day.hourmeter = apart.hourmeter AND day.words = apart.words)",
+            (key,),
+        )
         new_apart = tuple(block for block in (*ring.apart, *tied) if self._insert_apart(key, block, seen.look.wall))
         self._db.execute(
             "UPDATE controller SET product = ?, revision = ?, serial = ?, line = ?, device = ?, unit_id = ?, "

@@ -1,8 +1,13 @@
 from __future__ import annotations
 
+import asyncio
 import csv
 import io
 import json
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import aclosing
 from pathlib import Path
 
 import pytest
@@ -16,7 +21,7 @@ from gateway.faces.http.devices import DEVICE_LABELS
 from gateway.history.dates import HOUR_S
 from gateway.history.export import PIECE, export, rows_to_read
 from gateway.history.openmetrics import LABELS, daily_metrics
-from gateway.history.reader import HistoryReader
+from gateway.history.reader import HistoryReader, StoredDay
 from gateway.history.source import HistorySource
 from tests.history.blocks import WALL, block
 
@@ -187,3 +192,39 @@ async def test_the_source_reads_beside_the_loop(history: Path) -> None:
     assert await source.devices() == {"array-1", 'the "second"'}
     got = b"".join([piece async for piece in source.export(LogFormat.JSON, ALL)])
     assert got.decode() == text(history, LogFormat.JSON)
+
+
+@pytest.mark.parametrize("after", [0, 1])
+async def test_an_export_that_is_broken_off_closes_its_file(
+    history: Path, after: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entered, closed_while_reading = threading.Event(), []
+    real_days, real_close = HistoryReader.days, HistoryReader.close
+    reading = threading.Lock()
+
+    def slow_days(reader: HistoryReader, selection: Selection) -> Iterator[StoredDay]:
+        for number, day in enumerate(real_days(reader, selection)):
+            with reading:
+                if number == 100 * after:
+                    entered.set()
+                    time.sleep(0.05)
+            yield day
+
+    def close(reader: HistoryReader) -> None:
+        closed_while_reading.append(reading.locked())
+        real_close(reader)
+
+    monkeypatch.setattr(HistoryReader, "days", slow_days)
+    monkeypatch.setattr(HistoryReader, "close", close)
+
+    async def take() -> None:
+        async with aclosing(HistorySource(history, "ridge-07").export(LogFormat.JSON, ALL)) as pieces:
+            async for _ in pieces:
+                pass
+
+    task = asyncio.create_task(take())
+    await asyncio.to_thread(entered.wait)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert closed_while_reading == [False]

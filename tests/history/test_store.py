@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import json
 import os
 import sqlite3
@@ -88,6 +89,13 @@ def test_blocks_apart_are_told_once(store: Store) -> None:
     kept = store.keep_ring(seen(LIVE), LAYOUT, odd)
     assert [(found.hourmeter, found.why) for found in kept.new_apart] == [(7, Why.ORDER)]
     assert store.keep_ring(seen(LIVE), LAYOUT, odd).new_apart == ()
+
+
+def test_a_block_that_turns_out_to_be_a_day_is_not_apart_any_more(store: Store) -> None:
+    early = {**RING, 100: block(HOURS[-1] + 24)}
+    assert store.keep_ring(seen(LIVE), LAYOUT, early).apart == 1  # ahead of an hourmeter that hung
+    kept = store.keep_ring(seen(LIVE + 24), LAYOUT, early)
+    assert (kept.days, kept.apart) == (101, 0)
 
 
 def test_a_ring_that_was_not_read_whole_is_read_again(store: Store) -> None:
@@ -298,3 +306,12 @@ def test_a_read_only_directory_is_said_and_can_still_be_read(tmp_path: Path) -> 
         assert caught.value.kind == "unwritable"
         with closing(open_for_reading(tmp_path)) as connection:
             assert connection.execute("SELECT count(*) FROM day").fetchone() == (100,)
+
+
+def test_a_directory_that_may_not_be_read_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(_path: Path) -> bool:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "is_file", refused)
+    with pytest.raises(HistoryError, match="history.sqlite3: Permission denied"):
+        open_for_reading(tmp_path)
