@@ -1,5 +1,6 @@
 #!/bin/bash
-# Installs the Debian packages of the foreign programs that the tests talk to, as far as they are missing.
+# Installs the Debian packages of the foreign programs that the tests talk to, as far as they are missing, and
+# with npm the clients of node/package.json, as they are locked there.
 #
 #   tests/peers/install.sh                every peer of the test suite
 #   tests/peers/install.sh PACKAGE...     only these packages
@@ -29,6 +30,8 @@ peers=(
   "libc6-dev /usr/include/stdio.h"
   "pkg-config pkg-config"
   "libmodbus-dev /usr/include/modbus/modbus.h"
+  "nodejs node"
+  "npm npm"
   "libsnmp-dev /usr/include/net-snmp/net-snmp-config.h"
 )
 policy=/usr/sbin/policy-rc.d
@@ -60,8 +63,26 @@ wanted=("$@")
 if ((${#wanted[@]} == 0)); then
   wanted=("${peers[@]%% *}")
 fi
+# node_clients: what npm installs, when every peer is wanted; a lock makes room for one at a time.
+node=$(dirname "$(readlink -f "$0")")/node
+all=$((!$#))
+node_clients() {
+  ((all)) || return 0
+  exec 9>"$node/.lock"
+  flock 9
+  [[ $node/node_modules/.package-lock.json -nt $node/package-lock.json ]] && return 0
+  echo 'Installing Node clients'
+  (cd "$node" && npm ci --omit=optional --ignore-scripts --no-audit --no-fund --loglevel=error >/dev/null) || {
+    echo 'npm could not install the clients of tests/peers/node/package.json.' >&2
+    exit 3
+  }
+}
+
 mapfile -t missing < <(missing_of "${wanted[@]}")
-((${#missing[@]})) || exit 0
+if ((${#missing[@]} == 0)); then
+  node_clients
+  exit 0
+fi
 
 refuse() {
   printf 'Missing Debian packages: %s\n  %s\n  Install them yourself with: apt-get install --no-install-recommends %s\n' \
@@ -118,3 +139,4 @@ fi
 
 mapfile -t missing < <(missing_of "${wanted[@]}")
 ((${#missing[@]} == 0)) || refuse "apt-get reported success, but they are still not found."
+node_clients
