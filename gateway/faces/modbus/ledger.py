@@ -24,65 +24,62 @@ KEEP = 4
 
 
 class LedgerFile:
-    """The ledger in `folder`; every method may raise OSError."""
+    """The ledger in `folder`; every method may raise OSError. Nothing is kept open between two calls."""
 
     def __init__(self, folder: Path, *, max_bytes: int = MAX_BYTES, keep: int = KEEP) -> None:
         self._folder = folder
         self._path = folder / NAME
         self._max_bytes = max_bytes
         self._keep = keep
-        self._fd: int | None = None
-        self._size = 0
-        self.book = Book()
+        self._book: Book | None = None
 
-    def open(self) -> Book:
-        """Open it, making it where it is not there, and give what its records amount to."""
-        if self._fd is not None:
-            return self.book
+    @property
+    def book(self) -> Book:
+        """What its records amount to; it was opened before."""
+        assert self._book is not None, "opened first"
+        return self._book
+
+    def open(self) -> None:
+        """Read what is there, once, and prove that it can be added to."""
+        if self._book is not None:
+            return
         self._folder.mkdir(parents=True, exist_ok=True)
         self._fresh.unlink(missing_ok=True)
         book = Book()
-        known = self._path if self._path.exists() else self._old(1)  # a kill between the two renames of `_begin_anew`
+        known = self._path if self._size() else self._old(1)  # a kill between the two renames of `_begin_anew`
         if known.exists():
             book.read(known.read_bytes().splitlines(keepends=True))
-        fd = self._create(self._path)
+        self._book = book
         try:
-            self._size = os.fstat(fd).st_size
-            if self._size and not _ends_a_line(self._path):
-                self._size += os.write(fd, b"\n")
-            if not self._size and (carried := _lines(book.carried(_latest(book)))):
-                _write_all(fd, carried)
-                self._size = len(carried)
-            os.fsync(fd)
+            self.append(())
+            self._sync_folder()
         except OSError:
-            os.close(fd)
+            self._book = None
             raise
-        self._fd, self.book = fd, book
-        self._sync_folder()
-        return book
 
     def append(self, records: Iterable[Record]) -> None:
         """Add records; on the disk when it returns, not there at all when it raises."""
-        assert self._fd is not None, "opened first"
         records = tuple(records)
-        data = _lines(records)
-        if self._size and self._size + len(data) > self._max_bytes:
+        data = b"".join(map(encode, records))
+        if self._size() and self._size() + len(data) > self._max_bytes:
             self._begin_anew()
+        fd = self._open_for_adding(self._path)
         try:
-            _write_all(self._fd, data)
-            os.fsync(self._fd)
-        except OSError:
-            os.ftruncate(self._fd, self._size)
-            raise
-        self._size += len(data)
+            size = os.fstat(fd).st_size
+            if not size:
+                data = self._carried() + data
+            elif os.pread(fd, 1, size - 1) != b"\n":
+                data = b"\n" + data
+            try:
+                _write_all(fd, data)
+                os.fsync(fd)
+            except OSError:
+                os.ftruncate(fd, size)
+                raise
+        finally:
+            os.close(fd)
         for record in records:
             self.book.apply(record)
-
-    def close(self) -> None:
-        """Close the file; `open` opens it again."""
-        if self._fd is not None:
-            os.close(self._fd)
-            self._fd = None
 
     @property
     def _fresh(self) -> Path:
@@ -91,30 +88,32 @@ class LedgerFile:
     def _old(self, number: int) -> Path:
         return self._path.with_name(f"{NAME}.{number}")
 
+    def _size(self) -> int:
+        return self._path.stat().st_size if self._path.exists() else 0
+
     def _begin_anew(self) -> None:
         """Rule 3."""
         self._fresh.unlink(missing_ok=True)
-        fd = self._create(self._fresh)
+        fd = self._open_for_adding(self._fresh)
         try:
-            data = _lines(self.book.carried(_latest(self.book)))
-            _write_all(fd, data)
+            _write_all(fd, self._carried())
             os.fsync(fd)
-            if self._path.exists():  # it is not when this broke off between the last two renames
-                for number in range(self._keep, 1, -1):
-                    if self._old(number - 1).exists():
-                        self._old(number - 1).replace(self._old(number))
-                self._path.replace(self._old(1))
-            self._fresh.replace(self._path)
-            self._sync_folder()
-        except OSError:
+        finally:
             os.close(fd)
-            raise
-        assert self._fd is not None
-        os.close(self._fd)
-        self._fd, self._size = fd, len(data)
+        for number in range(self._keep, 1, -1):
+            if self._old(number - 1).exists():
+                self._old(number - 1).replace(self._old(number))
+        self._path.replace(self._old(1))
+        self._fresh.replace(self._path)
+        self._sync_folder()
 
-    def _create(self, path: Path) -> int:
-        return os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o640)
+    def _carried(self) -> bytes:
+        book = self.book
+        latest = max((at for times in book.worn.values() for at in times), default=0.0)
+        return b"".join(map(encode, book.carried(latest)))
+
+    def _open_for_adding(self, path: Path) -> int:
+        return os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o640)
 
     def _sync_folder(self) -> None:
         fd = os.open(self._folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -135,21 +134,6 @@ def read_ledger(folder: Path) -> Iterator[Record]:
                     yield record
 
 
-def _latest(book: Book) -> float:
-    """The time of the latest thing that the book knows: by it, a day is counted."""
-    return max((at for times in book.worn.values() for at in times), default=0.0)
-
-
-def _lines(records: Iterable[Record]) -> bytes:
-    return b"".join(map(encode, records))
-
-
 def _write_all(fd: int, data: bytes) -> None:
     while data:
         data = data[os.write(fd, data) :]
-
-
-def _ends_a_line(path: Path) -> bool:
-    with path.open("rb") as file:
-        file.seek(-1, os.SEEK_END)
-        return file.read(1) == b"\n"

@@ -38,7 +38,6 @@ def opened(folder: Path, **options: int) -> LedgerFile:
 def known(folder: Path) -> Book:
     """What a gateway that starts now knows."""
     ledger = opened(folder)
-    ledger.close()
     return ledger.book
 
 
@@ -46,7 +45,6 @@ def test_what_was_added_is_there_after_the_next_start(tmp_path: Path) -> None:
     ledger = opened(tmp_path / "deep" / "er")
     ledger.append([intent(1), intent(2)])
     ledger.append([written(1)])
-    ledger.close()
     assert (tmp_path / "deep" / "er" / NAME).stat().st_mode & 0o007 == 0, "not for everybody"
     book = known(tmp_path / "deep" / "er")
     assert list(book.open) == ["2"]
@@ -57,12 +55,10 @@ def test_what_was_added_is_there_after_the_next_start(tmp_path: Path) -> None:
 def test_a_line_cut_off_by_a_power_failure_hides_no_other(tmp_path: Path, cut: int) -> None:
     ledger = opened(tmp_path)
     ledger.append([intent(1), written(1), intent(2)])
-    ledger.close()
     path = tmp_path / NAME
     path.write_bytes(path.read_bytes()[:-cut])
     ledger = opened(tmp_path)
     ledger.append([intent(3)])
-    ledger.close()
     assert [entry.intent.id for entry in entries(read_ledger(tmp_path))] == (
         ["1", "2", "3"] if cut == 1 else ["1", "3"]
     )
@@ -73,7 +69,6 @@ def test_its_size_is_bounded_and_what_is_needed_is_carried_on(tmp_path: Path) ->
     ledger.append([intent(0)])  # never settled
     for number in range(1, 200):
         ledger.append([intent(number), written(number)])
-    ledger.close()
     files = sorted(path.name for path in tmp_path.iterdir())
     assert files == [NAME, f"{NAME}.1", f"{NAME}.2", f"{NAME}.3"]
     assert all((tmp_path / name).stat().st_size < 20_000 for name in files)
@@ -109,11 +104,9 @@ def test_a_rotation_that_breaks_off_anywhere_loses_nothing(
     assert broken < number + 50
     assert sum(map(len, known(tmp_path).worn.values())) == broken
     if restarted:
-        ledger.close()
         ledger = opened(tmp_path, max_bytes=2000, keep=2)
     number = fill(ledger, broken, 30)
     assert number == broken + 30, "it goes on"
-    ledger.close()
     assert sum(map(len, known(tmp_path).worn.values())) == number
     assert len(list(tmp_path.iterdir())) == 3
 
