@@ -9,23 +9,27 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from gateway.cli.config_file import ConfigOption, load_or_exit
+from gateway.cli.config_file import ConfigOption, load_or_exit, refuse
+from gateway.clock import SystemClock
 from gateway.core.budget import LineBudget
 from gateway.service.advice import advice
 from gateway.service.config import Config
 from gateway.service.settings import line_budgets
 from gateway.service.snmp import snmp_on
+from gateway.service.tls import tls_problems
 
 
 def command(config: ConfigOption) -> None:
     """Check a configuration: exit status 0 and a projection of its lines, or 78 and every problem."""
     checked = load_or_exit(config)
+    problems = tls_problems(checked, SystemClock().wall())
+    if problems:
+        refuse(config, [f"{config}: {problem}" for problem in problems])
     budgets = line_budgets(checked)
     console = Console()
     console.print(_lines(checked, budgets), _devices(checked, budgets), sep="\n")
-    console.print(
-        f"Faces  Modbus TCP {_at(checked.modbus.listen)} · SNMP {_snmp(checked)} · HTTP {_at(checked.http.listen)}"
-    )
+    modbus = f"Modbus TCP {_at(checked.modbus.listen)}{_tls(checked)}"
+    console.print(f"Faces  {modbus} · SNMP {_snmp(checked)} · HTTP {_at(checked.http.listen)}")
     for text in advice(checked, budgets):
         console.print(f"[yellow]warning[/] {escape(text)}", soft_wrap=True)
     console.print(f"[green]{escape(str(config))} is right.[/]", soft_wrap=True)
@@ -70,6 +74,11 @@ def _devices(config: Config, budgets: Sequence[LineBudget]) -> Table:
 
 def _at(listen: Sequence[str]) -> str:
     return escape(", ".join(listen)) if listen else "off"
+
+
+def _tls(config: Config) -> str:
+    tls = config.modbus.tls
+    return "" if tls is None or not tls.listen else f" · Modbus TLS {_at(tls.listen)}"
 
 
 def _snmp(config: Config) -> str:

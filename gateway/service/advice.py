@@ -9,9 +9,11 @@ import ipaddress
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from gateway.clock import SystemClock
 from gateway.core.budget import LineBudget
 from gateway.service.schema import DOCUMENTATION_ROOT, Config, LineTable, parse_listen, parse_root
 from gateway.service.snmp import snmp_advice, snmp_on
+from gateway.service.tls import tls_advice
 from gateway.service.writes import write_advice
 
 SATURATED = 0.95
@@ -66,11 +68,15 @@ def _modbus(config: Config) -> Iterator[str]:
     for index, network in enumerate(config.modbus.allow):
         if ipaddress.ip_network(network).prefixlen == 0:
             yield f"modbus.allow[{index}]: {network} is everybody"
-    if exposed and all(ipaddress.ip_network(network).is_loopback for network in config.modbus.allow):
+    tls = () if config.modbus.tls is None else config.modbus.tls.listen
+    if (exposed or _beyond_loopback(tls)) and all(
+        ipaddress.ip_network(network).is_loopback for network in config.modbus.allow
+    ):
         yield "modbus.allow: only this machine may connect, so listening on other addresses is of no use"
     if config.modbus.listen and not config.modbus.allow:
         yield "modbus.allow: is empty, so nobody may connect"
     yield from write_advice(config)
+    yield from tls_advice(config, SystemClock().wall())
 
 
 def _snmp(config: Config) -> Iterator[str]:

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from gateway.devices.schema import load_map, models
 from gateway.service.problems import Path, Problem, render_path, show, table_at
 from gateway.service.schema import NOT_SUPPORTED, Address, parse_listen
+from gateway.service.schema_tls import TlsTable
 from gateway.service.snmp import snmp_problems
 from gateway.service.writes import rule_problems
 
@@ -136,6 +137,9 @@ def _listens(raw: Raw, face: str) -> Iterator[tuple[Path, object]]:
     own = _table(raw, face)
     tables: list[tuple[Path, object]] = [((face,), own.get("listen", list(table.model_fields["listen"].default)))]
     tables += [(path, listener.get("listen")) for path, listener in _tables(own, "listener", (face,))]
+    tls = own.get("tls")
+    if isinstance(tls, Mapping):
+        tables.append(((face, "tls"), tls.get("listen", list(TlsTable.model_fields["listen"].default))))
     for path, listens in tables:
         for index, text in enumerate(listens if isinstance(listens, list) else []):
             yield (*path, "listen", index), text

@@ -3,6 +3,7 @@
 Rule 1: nothing is opened while it is built; a mistake here is a bad configuration or a bug, never a busy port.
 Rule 2: the first SIGTERM or SIGINT stops in order (service/supervisor.py), the second ends the process at once.
         Both leave exit status 0.
+Rule 3: SIGHUP has the files of Modbus/TCP Security read again (faces/modbus/tls.py). The configuration is read once.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ class Gateway:
         )
         self.site = Site.of(config.site, self.lines, [device for group in groups for device in group])
         stats = ModbusServerStats()
-        modbus = ModbusServer(modbus_settings(config), self.site, clock, stats)
+        self._modbus = modbus = ModbusServer(modbus_settings(config), self.site, clock, stats)
         snmp = SnmpAgent(snmp_settings(config), self.site, clock, stats)
         history = HistoryStats() if config.history.enabled else None
         kept = history_settings(config)
@@ -71,8 +72,15 @@ class Gateway:
         self.supervisor = Supervisor(clock, self.lines, self.listeners, self.keepers)
 
     def not_ready(self) -> tuple[str, ...]:
-        """Why the gateway does not do what its configuration says: the listeners that are not open."""
-        return tuple(f"{label} is not open" for label in self.supervisor.down())
+        """Why the gateway does not do what its configuration says: listeners not open, files that cannot be used."""
+        closed = tuple(f"{label} is not open" for label in self.supervisor.down())
+        tls = self._modbus.stats.tls
+        return closed if tls is None or not tls.problem else (*closed, f"modbus tls keeps its old files: {tls.problem}")
+
+    def reload(self) -> None:
+        """Take certificates, keys and CRLs as they are on disk now, or keep the old ones."""
+        if self._modbus.door is not None:
+            self._modbus.door.reload()
 
     async def run(self, stop: asyncio.Event) -> None:
         """Work until `stop` is set."""
@@ -91,6 +99,7 @@ async def _serve(config: Config) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         running.add_signal_handler(number, _stopper(number, stop))
     gateway = Gateway(config, SystemClock())
+    running.add_signal_handler(signal.SIGHUP, gateway.reload)
     for text in advice(config, line_budgets(config)):
         _log.warning('event=advice text="%s"', text.replace('"', "'"))
     _log.info(

@@ -41,6 +41,7 @@ from gateway.service.keys import (
     parse_root,
 )
 from gateway.service.schema_snmp import CommunityTable, SnmpTable, UserTable, ViewTable
+from gateway.service.schema_tls import ROLES, Roles, TlsTable
 
 __all__ = [
     "DOCUMENTATION_ROOT",
@@ -62,6 +63,7 @@ __all__ = [
     "RateTable",
     "SnmpTable",
     "Table",
+    "TlsTable",
     "UserTable",
     "ViewTable",
     "WriteTable",
@@ -227,7 +229,14 @@ class ListenerTable(Table):
 class WriteTable(Table):
     """`[[modbus.write]]`: who may write what; a request is allowed when rules allow all of it."""
 
-    source: Annotated[Networks, Key(NETWORKS + ", at least one", "Who may write.")] = Field(min_length=1)
+    source: Annotated[
+        Networks,
+        Key(NETWORKS + ", at least one", "Who may write, by address; left out: from anywhere, if role says who."),
+    ] = Field(default=(), min_length=1)
+    role: Annotated[
+        Roles,
+        Key(ROLES, "Who may write, by the role of its certificate: over TLS only. With source: both must hold."),
+    ] = Field(default=(), min_length=1)
     unit_id: Annotated[
         Annotated[tuple[Annotated[int, Field(ge=1, le=247)], ...], Field(strict=False)],
         Key("a list of unit ids of the file", "On which controllers; left out: on all."),
@@ -327,6 +336,10 @@ class ModbusTable(Table):
         Annotated[tuple[WriteTable, ...], Field(strict=False)],
         Key("[[modbus.write]] tables", "Who may write what; without one nobody can."),
     ] = ()
+    tls: Annotated[
+        TlsTable | None,
+        Key("a [modbus.tls] table", "Modbus/TCP Security; left out: none."),
+    ] = None
     rate: Annotated[RateTable, Key("a [modbus.rate] table", "How often clients may ask.")] = RateTable()
     listener: Annotated[
         Annotated[tuple[ListenerTable, ...], Field(strict=False)],

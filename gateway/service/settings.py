@@ -15,6 +15,7 @@ from gateway.faces.http.settings import HttpSettings
 from gateway.faces.modbus.settings import LineListen, ModbusSettings, Network, RateSettings
 from gateway.history.settings import HistorySettings
 from gateway.service.schema import Config, LineTable, RateTable, parse_listen
+from gateway.service.tls import tls_settings
 from gateway.service.writes import line_writes, write_rules, write_settings
 
 Pairs = tuple[tuple[str, int], ...]
@@ -91,6 +92,7 @@ def modbus_settings(config: Config) -> ModbusSettings:
         allow=_networks(modbus.allow),
         max_age_s=config.cache.max_age_s,
         writes=write_settings(config),
+        tls=tls_settings(config),
         strict_map=modbus.strict_map,
         reply_timeout_s=deadline_s - WATCH_S,
         stop_grace_s=STOP_GRACE_S,

@@ -52,6 +52,8 @@ def rule_problems(tables: Sequence[tuple[Path, Raw]], devices: Sequence[Raw]) ->
             maps = [load_map(model) for model in dict.fromkeys(str(device["model"]) for device in chosen)]
             yield from _named(path, table, maps)
             yield from _ranges(path, table, maps)
+        if not any(table.get(key) for key in ("source", "role")):
+            yield Problem(path, "holds for nobody; allowed: source or role, at least one of them")
         if not any(table.get(key) for key in ("point", "registers", "coils")):
             yield Problem(path, "allows nothing; allowed: point, registers or coils, at least one of them")
 
@@ -87,6 +89,7 @@ def write_advice(config: Config) -> Iterator[str]:
 def _rule(table: WriteTable) -> WriteRule:
     return WriteRule(
         sources=tuple(ipaddress.ip_network(source) for source in table.source) or None,
+        roles=frozenset(table.role) or None,
         unit_ids=frozenset(table.unit_id) or None,
         points=frozenset(table.point),
         registers=tuple(Range(*parse_range(text)) for text in table.registers),

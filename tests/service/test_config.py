@@ -128,7 +128,7 @@ def test_the_full_example_shows_the_defaults() -> None:
     assert full.poll.model_copy(update={"night_s": None}) == minimal.poll  # TOML cannot show "as by day"
     assert full.cache == minimal.cache
     rate = full.modbus.rate.model_copy(update={"network": ()})
-    assert full.modbus.model_copy(update={"listener": (), "write": (), "rate": rate}) == minimal.modbus
+    assert full.modbus.model_copy(update={"listener": (), "write": (), "rate": rate, "tls": None}) == minimal.modbus
     assert full.http == minimal.http
     assert full.state_dir == minimal.state_dir
     shown = set(type(full.line[0]).model_fields) - {"name", "port", "device"}
@@ -218,7 +218,7 @@ listen = ["127.0.0.1:70000"]
         (MINIMAL + "[cache]\nmax_age_s = 1979-05-27\n", "cache.max_age_s: 1979-05-27 is not a number"),
         (MINIMAL + "[modbus]\nmax_connections = 1.5\n", "modbus.max_connections: 1.5 is not a whole number"),
         (MINIMAL + "[modbus]\nwrites = 0\n", "modbus.writes: 0 is not true or false; allowed: true or false"),
-        (MINIMAL + "[[modbus.write]]\n", "modbus.write[0].source: is missing; allowed: a list of addresses"),
+        (MINIMAL + "[[modbus.write]]\n", "modbus.write[0]: holds for nobody; allowed: source or role"),
         (MINIMAL + WRITE, "modbus.write[0]: allows nothing; allowed: point, registers or coils"),
         (MINIMAL + WRITE + "unit_id = [99]\n", "modbus.write[0].unit_id[0]: no device has unit id 99; allowed: 11"),
         (

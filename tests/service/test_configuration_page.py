@@ -23,6 +23,7 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "`[modbus]`": schema.ModbusTable,
     "`[modbus.rate]`": schema.RateTable,
     "`[[modbus.rate.network]]`": schema.ClientNetworkTable,
+    "`[modbus.tls]`": schema.TlsTable,
     "`[[modbus.listener]]`": schema.ListenerTable,
     "`[[modbus.write]]`": schema.WriteTable,
     "`[snmp]`": schema.SnmpTable,

@@ -14,13 +14,13 @@ from gateway import __version__
 from gateway.clock import Clock
 from gateway.core.clients import Client
 from gateway.core.site import Site
-from gateway.core.stats import HistoryStats, ModbusServerStats
+from gateway.core.stats import HistoryStats, ModbusServerStats, TlsStats
 from gateway.faces.http.clients import CLIENT_RULES, client_sources
 from gateway.faces.http.devices import DEVICE_LABELS, device_labels
 from gateway.faces.http.history import DEVICE_HISTORY_RULES, STORE_RULES, DeviceHistoryView
 from gateway.faces.http.lines import DEVICE_RULES, LINE_LABELS, LINE_RULES, LineView
 from gateway.faces.http.metric import MetricInfo
-from gateway.faces.http.rules import Rule, Source, each, families, gateway_counter, gateway_gauge, one
+from gateway.faces.http.rules import Rule, Source, each, families, gateway_counter, gateway_gauge, known, one
 from gateway.faces.http.text import Lines
 
 
@@ -105,6 +105,31 @@ MODBUS_RULES: tuple[Rule[ModbusServerStats], ...] = (
     ),
 )
 
+TLS_RULES: tuple[Rule[TlsStats], ...] = (
+    one(
+        gateway_counter("modbus_tls_handshakes", "TLS handshakes of Modbus clients that were let in."),
+        lambda stats: stats.handshakes,
+    ),
+    each(
+        gateway_counter("modbus_tls_handshakes_refused", "TLS handshakes that failed, by reason.", "reason"),
+        lambda stats: stats.refused,
+    ),
+    one(
+        gateway_counter("modbus_tls_reload_failures", "Times that new certificate files could not be used."),
+        lambda stats: stats.reload_failures,
+    ),
+    one(
+        gateway_gauge("modbus_tls_files_in_use", "1 while the certificate files last read are those in use."),
+        lambda stats: not stats.problem,
+    ),
+    known(
+        gateway_gauge(
+            "modbus_tls_certificate_expiry_timestamp_seconds", "When the server's certificate expires, Unix time."
+        ),
+        lambda stats: stats.not_after,
+    ),
+)
+
 SNMP_RULES: tuple[Rule[Mapping[str, int]], ...] = (
     each(gateway_counter("snmp_events", "What the SNMP face counted, by event.", "event"), lambda stats: stats),
 )
@@ -135,6 +160,7 @@ OWN_METRICS: tuple[MetricInfo, ...] = tuple(
         DEVICE_RULES,
         MODBUS_RULES,
         CLIENT_RULES,
+        TLS_RULES,
         SNMP_RULES,
         HTTP_RULES,
         STORE_RULES,
@@ -183,6 +209,8 @@ class OwnMetrics:
         yield from families(DEVICE_RULES, self._devices)
         yield from families(MODBUS_RULES, [Source(counts.modbus)])
         yield from families(CLIENT_RULES, client_sources(counts.clients, now))
+        if counts.modbus.tls is not None:
+            yield from families(TLS_RULES, [Source(counts.modbus.tls)])
         yield from families(SNMP_RULES, [Source(counts.snmp())])
         yield from families(HTTP_RULES, [Source(counts.http)])
         if counts.history is not None:

@@ -151,7 +151,7 @@ class ModbusServer:
             listeners += [Listener(self, self.dispatcher, host, port, door=door) for host, port in settings.tls.listen]
             self.door = door
         self.listeners: Sequence[Listener] = tuple(listeners)
-        self._stats = stats
+        self.stats = stats
         self._now = clock.monotonic
         self._connections: set[Connection] = set()
         self._listening: set[Listener] = set()
@@ -161,7 +161,7 @@ class ModbusServer:
     def admit(self, listener: Listener, connection: Connection, peer: str) -> Client | None:
         """Whose connection this is, when it may stay (rules 1 and 2)."""
         now = self._now()
-        self._stats.connections += 1
+        self.stats.connections += 1
         verdict = decide(self._connections, peer, self.settings, now)
         if verdict.leaves is not None:
             verdict.leaves.end("evicted")
@@ -170,7 +170,7 @@ class ModbusServer:
             self._refuse(verdict.refused, peer)
             return None
         self._connections.add(connection)
-        self._stats.open_connections = len(self._connections)
+        self.stats.open_connections = len(self._connections)
         listener.joined(connection)
         return self.clients.arrived(peer, rate_of(peer, self.settings.rate), now)
 
@@ -179,7 +179,7 @@ class ModbusServer:
         if connection not in self._connections:
             return
         self._connections.discard(connection)
-        self._stats.open_connections = len(self._connections)
+        self.stats.open_connections = len(self._connections)
         self.clients.left(connection.client, connection.seen)
 
     def started(self, listener: Listener) -> None:
@@ -215,8 +215,8 @@ class ModbusServer:
         self.sweep()
 
     def _refuse(self, reason: str, peer: str) -> None:
-        self._stats.refused_connections += 1
-        self._stats.closed[reason] += 1
+        self.stats.refused_connections += 1
+        self.stats.closed[reason] += 1
         left_out = self._refusals_told.spend((reason, peer), self._now())
         if left_out is not None:
             logger.warning("event=connection_refused peer=%s reason=%s left_out=%d", peer, reason, left_out)

@@ -12,7 +12,7 @@ from gateway import __version__
 from gateway.core.clients import ClientTable
 from gateway.core.ratelimit import ClientRate
 from gateway.core.site import LineState, Site
-from gateway.core.stats import DeviceHistoryStats, HistoryStats, ModbusServerStats
+from gateway.core.stats import DeviceHistoryStats, HistoryStats, ModbusServerStats, TlsStats
 from gateway.faces.http.exposition import Exposition
 from gateway.faces.http.lines import ERROR_KINDS
 from gateway.faces.http.metric import MetricInfo, MetricKind
@@ -97,7 +97,7 @@ def test_version_and_start(site: Site, clock: ManualClock) -> None:
 
 
 def test_what_is_collected_is_what_is_described(site: Site, clock: ManualClock) -> None:
-    modbus = ModbusServerStats()
+    modbus = ModbusServerStats(tls=TlsStats(1, Counter(timeout=1), not_after=2e9))
     modbus.exceptions[2] = 1
     for reasons in (modbus.malformed, modbus.refused, modbus.limited, modbus.writes, modbus.closed):
         reasons["because"] = 1

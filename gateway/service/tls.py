@@ -1,0 +1,68 @@
+"""Modbus/TCP Security, from the configuration: its settings, what is wrong with its files, what is worth a second look.
+
+Files that are bad do not keep the gateway from starting: that may be the clock's fault, after a power cut, and the
+other faces do not need them. `check-config` calls them problems; a running gateway keeps the TLS port closed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+
+from gateway.errors import TlsFilesError
+from gateway.faces.modbus.settings import TlsSettings
+from gateway.faces.modbus.tls_files import TlsFiles, exposed_key, load
+from gateway.service.keys import parse_listen
+from gateway.service.schema import Config
+
+SOON_S = timedelta(days=30).total_seconds()
+
+
+def tls_settings(config: Config) -> TlsSettings | None:
+    """The settings of the TLS listeners; None where there is none."""
+    tls = config.modbus.tls
+    if tls is None or not tls.listen:
+        return None
+    return TlsSettings(
+        listen=tuple((address.host, address.port) for address in map(parse_listen, tls.listen)),
+        files=TlsFiles(
+            Path(tls.certificate_file),
+            Path(tls.key_file),
+            Path(tls.client_ca_file),
+            Path(tls.crl_file) if tls.crl_file else None,
+        ),
+        require_role=tls.require_role,
+    )
+
+
+def tls_problems(config: Config, now: float) -> tuple[str, ...]:
+    """What is wrong with the files at wall time `now`, each with its key path."""
+    settings = tls_settings(config)
+    if settings is None:
+        return ()
+    try:
+        load(settings.files, now)
+    except TlsFilesError as error:
+        return tuple(f"modbus.tls.{key}: {text}" for key, text in error.problems)
+    return ()
+
+
+def tls_advice(config: Config, now: float) -> Iterator[str]:
+    """What an experienced colleague would say."""
+    settings = tls_settings(config)
+    for index, rule in enumerate(config.modbus.write if settings is None else ()):
+        if rule.role:
+            yield f"modbus.write[{index}].role: holds for nobody, because [modbus.tls] does not listen"
+    if settings is None:
+        return
+    if exposed_key(settings.files):
+        yield f"modbus.tls.key_file: {settings.files.key} can be read by every user of this machine"
+    try:
+        left_s = load(settings.files, now).not_after - now
+    except TlsFilesError as error:
+        for key, text in error.problems:
+            yield f"modbus.tls.{key}: {text}; the TLS port stays closed until that is mended"
+        return
+    if left_s < SOON_S:
+        yield f"modbus.tls.certificate_file: expires in {left_s / 86400:.0f} days"
