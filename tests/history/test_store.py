@@ -313,5 +313,5 @@ def test_a_directory_that_may_not_be_read_is_said(tmp_path: Path, monkeypatch: p
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(Path, "is_file", refused)
-    with pytest.raises(HistoryError, match="history.sqlite3: Permission denied"):
+    with pytest.raises(HistoryError, match=r"history\.sqlite3: Permission denied"):
         open_for_reading(tmp_path)
