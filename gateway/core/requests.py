@@ -1,6 +1,7 @@
 """What waits for a line: reads and writes with those who asked for them.
 
-Rule 1: every asker is told once how its request ended, or has left; nobody is told after leaving.
+Rule 1: every asker is told once how its request ended, or has left; nobody is told after leaving. What came of a
+        request that was on the wire by then goes where the asker said when it left.
 Rule 2: identical reads of one device are one `ClientRead` with several waiters; a read whose last waiter left is
         not wanted any more and is not made.
 Rule 3: a write has one waiter and is made once.
@@ -44,10 +45,11 @@ class Purpose(StrEnum):
 class Waiter:
     """One asker; the `Ticket` it holds."""
 
-    __slots__ = ("_done", "asked_at", "client")
+    __slots__ = ("_done", "_keep", "asked_at", "client")
 
     def __init__(self, done: Callable[[Outcome], None], client: str, asked_at: float) -> None:
         self._done: Callable[[Outcome], None] | None = done
+        self._keep: Callable[[Outcome], None] | None = None
         self.client = client
         self.asked_at = asked_at
 
@@ -56,13 +58,14 @@ class Waiter:
         """Whether the asker is gone or has been told."""
         return self._done is None
 
-    def cancel(self) -> None:
+    def cancel(self, keep: Callable[[Outcome], None] | None = None) -> None:
         """See `core.site.Ticket`."""
-        self._done = None
+        if self._done is not None:
+            self._done, self._keep = None, keep
 
     def finish(self, outcome: Outcome) -> None:
-        """Tell the asker, once, unless it left."""
-        done, self._done = self._done, None
+        """Tell the asker, once; what it left behind when it left."""
+        done, self._done, self._keep = self._done or self._keep, None, None
         if done is not None:
             done(outcome)
 

@@ -45,8 +45,11 @@ class LineStatus:
 class Ticket(Protocol):
     """A read that is under way for somebody."""
 
-    def cancel(self) -> None:
-        """The asker is gone: `done` will not be called. Others who share the read are not affected."""
+    def cancel(self, keep: Callable[[Outcome], None] | None = None) -> None:
+        """The asker is gone: `done` will not be called. Others who share the read are not affected.
+
+        A request that is on the wire by now runs to its end; `keep` gets what came of it, for others who may ask.
+        """
         ...
 
 

@@ -15,6 +15,7 @@ from dataclasses import replace
 
 from gateway.clock import SystemClock
 from gateway.core.ratelimit import ClientRate
+from gateway.core.requests import Waiter
 from gateway.core.site import Device, LineState, LineStatus, Outcome, Site
 from gateway.core.snapshot import Block, DeviceState
 from gateway.core.stats import LineStats, ModbusServerStats
@@ -41,11 +42,13 @@ class NoLine:
 
     def read(
         self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "", background: bool = False
-    ) -> asyncio.Handle:
-        del device, pdu, client, background
-        return asyncio.get_running_loop().call_soon(done, LineDown())
+    ) -> Waiter:
+        del device, pdu, background
+        ticket = Waiter(done, client, 0.0)
+        asyncio.get_running_loop().call_soon(ticket.finish, LineDown())
+        return ticket
 
-    def write(self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "") -> asyncio.Handle:
+    def write(self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "") -> Waiter:
         return self.read(device, pdu, done, client=client)
 
 

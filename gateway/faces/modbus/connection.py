@@ -167,7 +167,7 @@ class Connection(asyncio.Protocol):
             self._resume.cancel()
         for due in self._due:
             if due.ticket is not None:
-                due.ticket.cancel()
+                due.ticket.cancel(None if due.waiting is None else due.waiting.concluded)
         self._due.clear()
         self._adus.clear()
         self._input = b""

@@ -55,8 +55,8 @@ class Forward:
         device = self.serving.device
         return device.line.read(device, self.ask.pdu, done, client=client)
 
-    def concluded(self, outcome: bytes) -> None:
-        """The line has answered."""
+    def concluded(self, outcome: Outcome) -> None:
+        """The line has answered, perhaps after its client left."""
         self.serving.learn(self.ask, outcome)
 
 
@@ -79,7 +79,7 @@ class WriteOrder:
         del client  # the job knows who asked
         return self.writer.submit(self.job, done, self.serving.forget)
 
-    def concluded(self, outcome: bytes) -> None:
+    def concluded(self, outcome: Outcome) -> None:
         """A write teaches nothing: what it wrote is read again."""
 
 

@@ -66,8 +66,9 @@ class _Order:
         self.done: Callable[[Outcome], None] | None = done
         self.forget = forget
 
-    def cancel(self) -> None:
-        """See `core.site.Ticket`."""
+    def cancel(self, keep: Callable[[Outcome], None] | None = None) -> None:
+        """See `core.site.Ticket`; a write leaves nothing to keep."""
+        del keep
         self.done = None
 
 

@@ -111,7 +111,7 @@ class FakeTicket:
     done: Callable[[Outcome], None] | None
     client: str = ""
 
-    def cancel(self) -> None:
+    def cancel(self, keep: Callable[[Outcome], None] | None = None) -> None:
         self.done = None
 
 

@@ -67,7 +67,7 @@ class Ticket:
     done: Callable[[Outcome], None] | None
     write: bool
 
-    def cancel(self) -> None:
+    def cancel(self, keep: Callable[[Outcome], None] | None = None) -> None:
         self.done = None
 
 
