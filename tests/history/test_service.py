@@ -92,7 +92,7 @@ async def test_a_gateway_keeps_the_days_of_its_controllers(tmp_path: Path, free_
             gateway.send_signal(signal.SIGTERM)
             _, said = await gateway.communicate()
     assert gateway.returncode == 0
-    assert 'prostar_gateway_history_days{device="array-1"' in metrics
+    assert 'prostar_gateway_history_blocks{device="array-1"' in metrics
     assert "_daily_" not in metrics
     assert b"event=history_harvested" in said
     assert b"level=error" not in said

@@ -25,7 +25,9 @@ class DeviceHistoryView:
 
 DEVICE_HISTORY_RULES: tuple[Rule[DeviceHistoryView], ...] = (
     known(
-        gateway_gauge("history_days", "Days stored of the controller that is there now.", *DEVICE_LABELS),
+        gateway_gauge(
+            "history_blocks", "Days (log blocks) stored of the controller that is there now.", *DEVICE_LABELS
+        ),
         lambda view: view.stats.days,
     ),
     known(
