@@ -6,6 +6,7 @@ Advice never keeps the gateway from starting. Each begins with the key path, as 
 from __future__ import annotations
 
 import ipaddress
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -17,6 +18,12 @@ from gateway.service.tls import tls_advice
 from gateway.service.writes import write_advice
 
 SATURATED = 0.95
+_NAMELESS = re.compile(
+    r"/dev/serial/by-id/usb-"
+    r"(1a86_USB[^-]*([-_]Ser[^-]*)?|Prolific_Technology_Inc\._USB-Serial_Controller(_[A-D])?|Silicon_Labs_CP21\w+_0001)-if"
+)
+"""CH340, PL2303, and CP210x as they leave the factory."""
+
 GUESSED_COMMUNITIES = ("public", "private")
 
 
@@ -54,6 +61,9 @@ def _port(path: str, line: LineTable, seen: dict[str, str]) -> Iterator[str]:
     if port.startswith(("/dev/ttyUSB", "/dev/ttyACM")):
         text = f"{port} may be another adapter after the next start"
         yield f"{path}: {text}; use its name in /dev/serial/by-id or /dev/serial/by-path"
+    if _NAMELESS.match(port):
+        text = "adapters of this kind have no serial number of their own, so two of them share one name"
+        yield f"{path}: {text}; use the name of the socket in /dev/serial/by-path"
     real = str(Path(port).resolve())
     if real in seen:
         yield f"{path}: {port} is at present the same port as {seen[real]}; only one line can have it"

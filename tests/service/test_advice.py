@@ -25,6 +25,8 @@ def advised(text: str) -> tuple[str, ...]:
 
 def test_a_file_that_is_as_it_should_be_needs_none() -> None:
     assert advised(CLEAN) == ()
+    for name in ("by-id/usb-FTDI_FT232R_USB_UART_A50285BI-if00-port0", "by-path/pci-0000:00:14.0-usb-0:2:1.0-port0"):
+        assert advised(CLEAN.replace("by-id/usb-a", name)) == ()
 
 
 @pytest.mark.parametrize(
@@ -37,6 +39,15 @@ def test_a_file_that_is_as_it_should_be_needs_none() -> None:
         ),
         (CLEAN.replace("/dev/serial/by-id/usb-a", "/dev/ttyUSB0"), "line[0].port: /dev/ttyUSB0 may be another adapter"),
         (CLEAN.replace("/dev/serial/by-id/usb-a", "/dev/ttyACM0"), "line[0].port: /dev/ttyACM0 may be another adapter"),
+        *(
+            (CLEAN.replace("usb-a", f"usb-{name}"), "line[0].port: adapters of this kind have no serial number")
+            for name in (
+                "1a86_USB_Serial-if00-port0",
+                "1a86_USB2.0-Serial-if00-port0",
+                "Prolific_Technology_Inc._USB-Serial_Controller-if00-port0",
+                "Silicon_Labs_CP2102_USB_to_UART_Bridge_Controller_0001-if00-port0",
+            )
+        ),
         (
             CLEAN + '[modbus]\nlisten = ["0.0.0.0:1502"]\nallow = ["10.0.0.0/8"]\n',
             "modbus.listen[0]: 0.0.0.0:1502 can be reached from other machines, and Modbus TCP has no password",
