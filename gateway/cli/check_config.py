@@ -14,7 +14,7 @@ from gateway.clock import SystemClock
 from gateway.core.budget import LineBudget
 from gateway.service.advice import advice
 from gateway.service.config import Config
-from gateway.service.settings import line_budgets
+from gateway.service.settings import line_budgets, line_settings
 from gateway.service.snmp import snmp_on
 from gateway.service.tls import tls_problems
 
@@ -30,9 +30,19 @@ def command(config: ConfigOption) -> None:
     console.print(_lines(checked, budgets), _devices(checked, budgets), sep="\n")
     modbus = f"Modbus TCP {_at(checked.modbus.listen)}{_tls(checked)}"
     console.print(f"Faces  {modbus} · SNMP {_snmp(checked)} · HTTP {_at(checked.http.listen)}")
+    console.print(f"Writes {_writes(checked)}")
     for text in advice(checked, budgets):
         console.print(f"[yellow]warning[/] {escape(text)}", soft_wrap=True)
     console.print(f"[green]{escape(str(config))} is right.[/]", soft_wrap=True)
+
+
+def _writes(config: Config) -> str:
+    """On which lines writes can go out."""
+    lines = [line.name for line in line_settings(config) if line.writes]
+    if not lines:
+        return "refused"
+    count = len(config.modbus.write)
+    return f"as far as {count} rule{'s' * (count != 1)} allow{'s' * (count == 1)}, on {escape(', '.join(lines))}"
 
 
 def _lines(config: Config, budgets: Sequence[LineBudget]) -> Table:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path as FilePath
 
 from gateway.core.site import Device
-from gateway.core.write_rules import Range, WriteRule, WriteRules
+from gateway.core.write_rules import Network, Range, WriteRule, WriteRules
 from gateway.core.write_wear import WearLimits
 from gateway.devices.model import Access, DeviceMap, Point, Space
 from gateway.devices.schema import load_map, models
@@ -72,6 +72,8 @@ def write_advice(config: Config) -> Iterator[str]:
         path = f"modbus.write[{index}]"
         for number, text in enumerate(table.source):
             network = ipaddress.ip_network(text)
+            if not any(_overlap(network, ipaddress.ip_network(allowed)) for allowed in modbus.allow):
+                yield f"{path}.source[{number}]: {network} may not connect at all (modbus.allow)"
             if network.prefixlen == 0:
                 yield f"{path}.source[{number}]: {network} is everybody"
             elif not network.is_loopback and network.num_addresses > 1:
@@ -95,6 +97,10 @@ def _rule(table: WriteTable) -> WriteRule:
         registers=tuple(Range(*parse_range(text)) for text in table.registers),
         coils=tuple(Range(*parse_range(text)) for text in table.coils),
     )
+
+
+def _overlap(one: Network, other: Network) -> bool:
+    return one.version == other.version and one.overlaps(other)
 
 
 def _covered(table: WriteTable, point: Point) -> bool:

@@ -104,3 +104,26 @@ def test_a_ledger_that_cannot_be_read(config: Path) -> None:
     done = CliRunner().invoke(app, ["writes", "-c", str(config)])
     assert done.exit_code == 1
     assert "the ledger cannot be read: Is a directory" in done.output
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", "Writes refused"),
+        ("[modbus]\nwrites = true\n", "Writes refused"),
+        (
+            '[modbus]\nwrites = true\n[[modbus.write]]\nsource = ["127.0.0.1"]\npoint = ["reset_control"]\n',
+            "Writes as far as 1 rule allows, on shelter-a",
+        ),
+        (
+            '[modbus]\nwrites = true\n[[modbus.write]]\nsource = ["127.0.0.1"]\ncoils = ["0x1"]\n'
+            '[[modbus.write]]\nsource = ["127.0.0.1"]\ncoils = ["0x2"]\n',
+            "Writes as far as 2 rules allow, on shelter-a",
+        ),
+    ],
+)
+def test_check_config_says_where_writes_can_go_out(config: Path, text: str, expected: str) -> None:
+    config.write_text(config.read_text() + text)
+    done = CliRunner(env={"COLUMNS": "160"}).invoke(app, ["check-config", "-c", str(config)])
+    assert done.exit_code == 0, done.output
+    assert expected in done.output.splitlines()

@@ -53,22 +53,29 @@ def test_rules_become_what_the_face_needs() -> None:
     assert rule.unit_ids is None
 
 
+ALLOW = 'allow = ["0.0.0.0/0"]\n'
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
         (ON, "modbus.writes: there is no [[modbus.write]] rule, so nobody may write"),
         (RULE + 'point = ["modbus_id"]\n', "modbus.write: has no effect as long as modbus.writes is false"),
         (
-            ON + '[[modbus.write]]\nsource = ["0.0.0.0/0"]\npoint = ["modbus_id"]\n',
+            ON + ALLOW + '[[modbus.write]]\nsource = ["0.0.0.0/0"]\npoint = ["modbus_id"]\n',
             "modbus.write[0].source[0]: 0.0.0.0/0 is everybody",
         ),
         (
-            ON + '[[modbus.write]]\nsource = ["192.0.2.0/30"]\npoint = ["modbus_id"]\n',
+            ON + ALLOW + '[[modbus.write]]\nsource = ["192.0.2.0/30"]\npoint = ["modbus_id"]\n',
             "modbus.write[0].source[0]: each of 4 addresses (192.0.2.0/30) may write",
         ),
         (
-            ON + RULE + 'point = ["modbus_id"]\nregisters = ["0xE030-0xE035"]\n',
+            ON + ALLOW + RULE + 'point = ["modbus_id"]\nregisters = ["0xE030-0xE035"]\n',
             "modbus.write[0]: to be written, these must be named in point, whatever the ranges: meterbus_id",
+        ),
+        (
+            ON + 'allow = ["198.51.100.0/24", "::1/128"]\n' + RULE + 'point = ["modbus_id"]\n',
+            "modbus.write[0].source[0]: 192.0.2.7/32 may not connect at all (modbus.allow)",
         ),
     ],
 )
