@@ -8,6 +8,8 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated
 
@@ -26,6 +28,9 @@ from gateway.history.export import export, rows_to_read, timestamp
 from gateway.history.reader import HistoryReader, StoredDay
 
 BAR_AFTER_S = 1.0
+WIDE = 104
+"""Columns from which on a table has the long names."""
+
 _HOUR_S = 3600.0
 
 
@@ -112,39 +117,55 @@ def _bar(total: int) -> Iterator[Callable[[int], None]]:
 
 
 def _table(reader: HistoryReader, selection: Selection) -> None:
-    of_models = {model: columns(model) for model in reader.models(selection)}
-    numbers = list({c.name: c for of_model in of_models.values() for c in of_model if c.bits is None}.values())
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("device", overflow="fold")
-    table.add_column("written (UTC, about)")
-    table.add_column("±", justify="right")
-    table.add_column("hourmeter\nh", justify="right")
-    for column in numbers:
-        table.add_column(_heading(column), justify="right")
-    table.add_column("what occurred", overflow="fold")
-    days, controllers = 0, set()
-    for day in reader.days(selection):
-        days += 1
-        controllers.add(day.owner.identity)
-        table.add_row(
-            escape(day.owner.device),
-            (timestamp(day.written_at) or "no date yet")[:16].replace("T", " "),
-            "" if day.error_s is None else f"{day.error_s / _HOUR_S:.1f} h",
-            str(day.hourmeter),
-            *(_cell(column, day) for column in numbers),
-            escape(_events(day, of_models[day.owner.model])),
-        )
+    """A table a controller; on a narrow terminal with the document's short names, explained below it."""
     console = Console()
-    if days:
+    wide = console.width >= WIDE
+    days, controllers = 0, 0
+    for owner, group in groupby(reader.days(selection), key=attrgetter("owner")):
+        of_model = columns(owner.model)
+        numbers = [column for column in of_model if column.bits is None]
+        known_as = "" if owner.identity == f"{owner.line}/{owner.device}" else f", controller {owner.identity}"
+        title = escape(f"{owner.device} on {owner.line}{known_as}")
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), title=title, title_justify="left")
+        table.add_column("written (UTC)\nabout", no_wrap=True)
+        table.add_column("±\nh", justify="right", no_wrap=True)
+        if wide:
+            table.add_column("hour-\nmeter\nh", justify="right", no_wrap=True)
+        for column in numbers:
+            table.add_column(_heading(column, wide=wide), justify="right", no_wrap=True)
+        occurred = []
+        for day in group:
+            days += 1
+            date = (timestamp(day.written_at) or "no date yet")[:16].replace("T", " ")
+            error = "" if day.error_s is None else f"{day.error_s / _HOUR_S:.1f}"
+            hours = [str(day.hourmeter)] if wide else []
+            table.add_row(date, error, *hours, *(_cell(column, day) for column in numbers))
+            if events := _events(day, of_model):
+                occurred.append(f"  {date}  {events}")
         console.print(table)
+        if not wide:
+            short = (f"{_short(column)}: {column.field.name.replace('_', ' ')}" for column in numbers)
+            console.print("; ".join(short), highlight=False, markup=False)
+        for line in occurred:
+            console.print(line, highlight=False, markup=False, soft_wrap=True)
+        controllers += 1
     apart = list(reader.apart(selection))
-    print(f"{days} days of {len(controllers)} controllers; {len(apart)} blocks kept apart")
+    print(f"{_count(days, 'day')} of {_count(controllers, 'controller')}; {_count(len(apart), 'block')} kept apart")
     for block in apart:
         print(f"  {block.owner.device}: block {block.slot}, hourmeter {block.hourmeter} h, {block.why}")
 
 
-def _heading(column: Column) -> str:
-    return "\n".join([*column.field.name.split("_"), "h:mm" if column.field.unit == "s" else column.field.unit])
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number != 1)}"
+
+
+def _short(column: Column) -> str:
+    return column.field.symbol.removesuffix("_daily")
+
+
+def _heading(column: Column, *, wide: bool) -> str:
+    words = column.field.name.split("_") if wide else _short(column).split("_")
+    return "\n".join([*words, "h:mm" if column.field.unit == "s" else column.field.unit])
 
 
 def _cell(column: Column, day: StoredDay) -> str:

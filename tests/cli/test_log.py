@@ -41,22 +41,30 @@ def config(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def run(config: Path) -> Run:
-    return lambda *arguments: CliRunner().invoke(app, ["log", "-c", str(config), *arguments], env={"COLUMNS": "200"})
+    def invoke(*arguments: str, env: dict[str, str] | None = None) -> Result:
+        return CliRunner().invoke(app, ["log", "-c", str(config), *arguments], env={"COLUMNS": "120", **(env or {})})
+
+    return invoke
 
 
-def test_the_table_has_dates_with_their_error(run: Run) -> None:
-    result = run()
+@pytest.mark.parametrize("width", [80, 104, 200])
+def test_the_table_has_dates_with_their_error(run: Run, width: int) -> None:
+    result = run(env={"COLUMNS": str(width)})
     assert result.exit_code == 0
-    newest = next(line for line in result.stdout.splitlines() if str(HOURS[-1]) in line)
-    assert re.search(rf"array-1 +2026-11-18 06:06 +1\.0 h +{HOURS[-1]} ", newest)
-    assert re.search(r"2:30 +0:00 +1:30 +alarms: \w+", newest)
-    assert "30 days of 1 controllers; 1 blocks kept apart" in result.stdout
+    hourmeter = rf"{HOURS[-1]} +" if width >= 104 else ""
+    row = rf"^ ?2026-11-18 06:06 +1\.0 +{hourmeter}\d\d\.\d\d +14\.25 +60\.0 +55\.0 +70\.00 +2:30 +0:00 +1:30 *$"
+    assert re.search(row, result.stdout, re.MULTILINE), result.stdout
+    assert re.search(r"^  2026-11-18 06:06  alarms: \w+$", result.stdout, re.MULTILINE)
+    assert "array-1 on shelter-a" in result.stdout
+    assert ("Vb_min: battery voltage minimum" in " ".join(result.stdout.split())) is (width < 104)
+    assert all(len(line) <= width for line in result.stdout.splitlines())
+    assert "30 days of 1 controller; 1 block kept apart" in result.stdout
     assert f"array-1: block 30, hourmeter {HOURS[-1]} h, tie" in result.stdout
 
 
 def test_a_selection_of_nothing_is_said(run: Run) -> None:
     result = run("--since", "2027-01-01")
-    assert (result.exit_code, result.stdout.splitlines()[0]) == (0, "0 days of 0 controllers; 1 blocks kept apart")
+    assert (result.exit_code, result.stdout.splitlines()[0]) == (0, "0 days of 0 controllers; 1 block kept apart")
 
 
 @pytest.mark.parametrize("form", ["csv", "json", "jsonl", "openmetrics"])
