@@ -116,8 +116,7 @@ def test_a_ledger_that_cannot_be_read(config: Path) -> None:
             "Writes as far as 1 rule allows, on shelter-a",
         ),
         (
-            '[modbus]\nwrites = true\n[[modbus.write]]\nsource = ["127.0.0.1"]\ncoils = ["0x1"]\n'
-            '[[modbus.write]]\nsource = ["127.0.0.1"]\ncoils = ["0x2"]\n',
+            "[modbus]\nwrites = true\n" + 2 * '[[modbus.write]]\nsource = ["127.0.0.1"]\ncoils = ["0x1"]\n',
             "Writes as far as 2 rules allow, on shelter-a",
         ),
     ],
