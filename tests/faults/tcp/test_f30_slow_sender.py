@@ -38,3 +38,20 @@ async def test_a_request_that_the_server_itself_left_half_read_is_not_late(runni
     line.release()
     assert await client.adus(200) == [mbap.Adu(1, 12, GOOD_REPLY[7:])] * 200
     assert not world.stats.closed
+
+
+async def test_a_byte_a_second_is_too_slow(running: Running) -> None:
+    world = running.world
+    world.poll(12)
+    slow, other = await running.connect(), await running.connect()
+    for sent in range(len(GOOD)):
+        slow.send(GOOD[sent : sent + 1])
+        await other.query(12, READ_1)
+        world.clock.now += 1.0
+        world.poll(12)
+        running.server.sweep()
+        if world.stats.closed:
+            break
+    assert sent == 5, "its first byte was taken six seconds ago"
+    assert await slow.rest() == b""
+    assert world.stats.closed == {"slow_frame": 1}
