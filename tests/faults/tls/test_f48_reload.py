@@ -158,10 +158,6 @@ enabled = false
 """
 
 
-def port_of(program: Program, listener: str) -> int:
-    return int(program.wait_for(f'event=listening listener="{listener} ').rpartition(":")[2])
-
-
 def serial_at(port: int, context: ssl.SSLContext) -> int:
     with (
         socket.create_connection(("127.0.0.1", port), timeout=10) as plain,

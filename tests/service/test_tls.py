@@ -1,0 +1,141 @@
+"""`[modbus.tls]` from the file to the face: what is wrong with it, and what is worth a second look."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from pathlib import Path
+
+import pytest
+
+from gateway.core.write_rules import Requester
+from gateway.errors import ConfigError
+from gateway.service.advice import advice
+from gateway.service.config import Config, parse_config
+from gateway.service.settings import line_budgets, modbus_settings
+from gateway.service.tls import tls_problems, tls_settings
+from gateway.service.writes import write_rules
+from tests.faces.modbus.tls.site import SERVER, Pki, run
+
+MINIMAL = """
+site = "ridge-07"
+[[line]]
+name = "shelter-a"
+port = "/dev/serial/by-id/usb-1"
+  [[line.device]]
+  name = "array-1"
+  address = 1
+  unit_id = 11
+  model = "prostar-mppt"
+"""
+TLS = """
+[modbus.tls]
+certificate_file = "{0}/server.pem"
+key_file = "{0}/server.key"
+client_ca_file = "{0}/ca.pem"
+"""
+
+
+@pytest.fixture
+def pki(tmp_path: Path) -> Pki:
+    return Pki.of_the_recipe(tmp_path / "pki")
+
+
+def config(pki: Pki, more: str = "") -> Config:
+    return parse_config(MINIMAL + TLS.format(pki.folder) + more)
+
+
+def problems(text: str) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        parse_config(MINIMAL + text, "c.toml")
+    return [problem.removeprefix("c.toml: ") for problem in caught.value.problems]
+
+
+def test_without_the_table_there_is_no_tls() -> None:
+    assert modbus_settings(parse_config(MINIMAL)).tls is None
+
+
+def test_with_it_port_802_is_the_default_and_a_role_is_required(pki: Pki) -> None:
+    settings = tls_settings(config(pki))
+    assert settings is not None
+    assert settings.listen == (("127.0.0.1", 802),)
+    assert settings.require_role
+    assert settings.files.crl is None
+    assert modbus_settings(config(pki)).tls == settings
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[modbus.tls]\n", "modbus.tls.certificate_file: is missing; allowed: the absolute path of a PEM file"),
+        ("[modbus.tls]\n", "modbus.tls.key_file: is missing; allowed: the absolute path of a PEM file"),
+        (
+            TLS.replace("{0}/ca.pem", "ca.pem"),
+            'modbus.tls.client_ca_file: "ca.pem" is not allowed; allowed: the absolute',
+        ),
+        (TLS + "key = 'x'\n", "modbus.tls.key: unknown key; "),
+        (TLS + '[modbus]\nlisten = ["127.0.0.1:802"]\n', '"127.0.0.1:802" clashes with modbus.'),
+        (
+            '[[modbus.write]]\nrole = ["a\\nb"]\n',
+            'modbus.write[0].role[0]: "a\\nb" is not allowed; allowed: a list of roles',
+        ),
+        ("[[modbus.write]]\nrole = []\n", "modbus.write[0].role: is empty; allowed: a list of roles"),
+        ('[[modbus.write]]\npoint = ["modbus_id"]\n', "modbus.write[0]: holds for nobody; allowed: source or role"),
+    ],
+)
+def test_a_problem_names_key_fault_and_what_is_allowed(text: str, expected: str) -> None:
+    assert any(expected in problem for problem in problems(text))
+
+
+def test_files_are_looked_at_only_where_it_listens(pki: Pki) -> None:
+    shutil.rmtree(pki.folder)
+    assert len(tls_problems(config(pki), time.time())) == 3
+    assert not tls_problems(config(pki, "listen = []\n"), time.time())
+
+
+def test_every_file_that_is_wrong_is_named(pki: Pki) -> None:
+    (pki.folder / "ca.pem").write_text("nothing")
+    (pki.folder / "server.key").unlink()
+    found = tls_problems(config(pki), time.time() + 366 * 86400)
+    assert [problem.partition(": ")[0] for problem in found] == [
+        "modbus.tls.key_file",
+        "modbus.tls.client_ca_file",
+        "modbus.tls.certificate_file",
+    ]
+    assert "cannot be read: No such file or directory" in found[0]
+    assert "holds no certificate" in found[1]
+    assert "expired on" in found[2]
+
+
+def test_a_key_with_a_passphrase_is_told_and_asks_nobody(pki: Pki) -> None:
+    run("openssl pkey -in server.key -aes256 -passout pass:secret -out locked && mv locked server.key", pki.folder)
+    (problem,) = tls_problems(config(pki), time.time())
+    assert problem == "modbus.tls.key_file: has a passphrase, which nobody can type; allowed: a key without one"
+
+
+def test_what_is_worth_a_second_look(pki: Pki) -> None:
+    pki.issue("server", usage=SERVER, days=(-1, 9.2))
+    (pki.folder / "server.key").chmod(0o644)
+    told = advice(config(pki), line_budgets(config(pki)))
+    assert f"modbus.tls.key_file: {pki.folder}/server.key can be read by every user of this machine" in told
+    assert "modbus.tls.certificate_file: expires in 9 days" in told
+
+
+def test_a_role_without_tls_is_told() -> None:
+    text = MINIMAL + '[modbus]\nwrites = true\n[[modbus.write]]\nrole = ["operator"]\npoint = ["modbus_id"]\n'
+    told = advice(parse_config(text), line_budgets(parse_config(text)))
+    assert "modbus.write[0].role: holds for nobody, because [modbus.tls] does not listen" in told
+
+
+def test_a_rule_by_role_holds_for_nobody_else(pki: Pki) -> None:
+    rules = '[modbus]\nwrites = true\n[[modbus.write]]\nrole = ["operator", "engineer"]\npoint = ["modbus_id"]\n'
+    (rule,) = write_rules(parse_config(MINIMAL + rules))
+    assert rule.holds_for(Requester("192.0.2.7", "operator"))
+    assert rule.holds_for(Requester("192.0.2.7", "engineer"))
+    assert not rule.holds_for(Requester("192.0.2.7", "Operator"))
+    assert not rule.holds_for(Requester("127.0.0.1", None))
+    both = rules.replace('role = ["operator", "engineer"]', 'role = ["operator"]\nsource = ["192.0.2.7/32"]')
+    (rule,) = write_rules(parse_config(MINIMAL + both))
+    assert rule.holds_for(Requester("192.0.2.7", "operator"))
+    assert not rule.holds_for(Requester("192.0.2.8", "operator"))
+    assert not rule.holds_for(Requester("192.0.2.7", None))
