@@ -192,3 +192,26 @@ def test_any_mix_of_failures_and_refusals_comes_to_an_end_with_nothing_half(data
     assert all(ring[slot] == words for slot, words in harvest.blocks.items())
     if harvest.outcome is Outcome.WHOLE:
         assert harvest.blocks.keys() | harvest.unread == set(range(256))
+
+
+def test_staged_blocks_that_cannot_be_proved_are_dropped() -> None:
+    ring = full_ring(HOURS)
+    controller = Controller(ring, lambda read: read.first <= 69 < read.first + read.count)
+    harvest = controller.harvest(Harvest(LAYOUT, LIVE, staged={slot: ring[slot] for slot in range(70)}))
+    assert (harvest.outcome, harvest.unread, harvest.stage_anew) == (Outcome.WHOLE, {69}, True)
+
+
+def test_a_controller_that_is_busy_is_asked_again() -> None:
+    harvest = Harvest(LAYOUT, LIVE)
+    read = harvest.next_read()
+    assert read is not None
+    assert harvest.replied(read, b"\x83\x06", 10.0) == {}
+    assert harvest.ready_at > 10.0
+    assert harvest.next_read() == read
+
+
+def test_a_ring_in_which_everything_is_new_ends_after_one_turn() -> None:
+    ring = full_ring(HOURS, first=1)
+    known = Position(0, HOURS[0] - 24, ring[0], HI_LO)
+    harvest = Controller(ring).harvest(Harvest(LAYOUT, LIVE, known))
+    assert (harvest.outcome, len(harvest.blocks)) == (Outcome.NEWER, 255)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -431,3 +432,37 @@ async def test_what_is_stored_is_known_again_after_a_restart(
 class Silent(SimulatedController):
     def hears(self, now: float) -> bool:
         return False
+
+
+class Logless(SimulatedController):
+    """Refuses every read of the log."""
+
+    def read(self, space: Space, first: int, count: int, now: float) -> list[int]:
+        if 0x8000 <= first < 0x9000:
+            raise missing(space, first)
+        return super().read(space, first, count, now)
+
+
+async def test_a_controller_without_a_log_is_asked_ever_more_seldom(gateway: Gateways) -> None:
+    async with gateway(Logless(MAP, seed=0, step_s=60.0)) as running:
+        await running.run(1000.0)
+        stats = running.stats.devices[11]
+        assert (stats.harvests, stats.failures["refused"]) == (0, 5)  # at 0, 1, 3, 7 and 15 minutes
+        assert len(log_reads(running)) < 30
+        assert running.port.devices[0].snapshot.shown()
+
+
+async def test_another_controller_in_the_middle_of_a_harvest_ends_it(
+    tmp_path: Path, gateway: Gateways, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    controller = unit(seed=0)
+    async with gateway(controller) as running:
+        await running.until(lambda: len(log_reads(running)) > 10)
+        snapshot = running.port.devices[0].snapshot
+        assert snapshot.identification is not None
+        other = replace(snapshot.identification, product="PS-MPPT-40M")
+        running.port.devices[0].snapshot = replace(snapshot, identification=other)
+        await running.until(lambda: running.stats.devices[11].failures["another_controller"])
+        assert stored(tmp_path) == {}
+        await running.until(lambda: running.stats.devices[11].harvests)
+    assert rows(tmp_path, "SELECT product FROM controller") == [("PS-MPPT-40M",)]
