@@ -96,7 +96,7 @@ class LineEngine:
         self._accounting = Accounting(self.stats, now)
         self._turn: Turn | None = None
         self._held: Turn | None = None  # waits for the settling question that is on the wire, or was just answered
-        self._window_s = self._rtu.quarantine_s(now)
+        self._window_s = self._calm_window_s = self._rtu.quarantine_s(now)
         self._sent_at = now
         self._finished: deque[tuple[Waiter, Outcome]] = deque()
         self._state = LineState.DOWN
@@ -378,7 +378,7 @@ class LineEngine:
         window_s = self._rtu.quarantine_s(now)
         if window_s > self._window_s:
             log.warning("event=late_replies line=%s quarantine_s=%g", self.settings.name, window_s)
-        elif window_s < self._window_s and window_s <= self.settings.quarantine_s:
+        elif window_s < self._window_s and window_s <= self._calm_window_s:
             log.info("event=late_replies_over line=%s quarantine_s=%g", self.settings.name, window_s)
         self._window_s = window_s
 

@@ -66,18 +66,22 @@ def test_two_within_a_minute_double_the_window_up_to_two_seconds_with_one_warnin
     assert "line=line quarantine_s=0.2" in warnings[0].getMessage()
 
 
-def test_the_window_shrinks_again_and_says_so_once(rig: MakeRig, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("gap_s", [0.0, 0.2])
+def test_the_window_shrinks_again_and_says_so_once(
+    rig: MakeRig, caplog: pytest.LogCaptureFixture, gap_s: float
+) -> None:
     caplog.set_level(logging.INFO)
-    line = rig(retries=0)
+    line = rig(retries=0, gap_s=gap_s)
+    calm_s = max(0.1, gap_s)
     for _ in range(2):
         miss(line, 0.9)
         line.run(3.0)
-    assert window_s(line) == pytest.approx(0.2)
+    assert window_s(line) == pytest.approx(2 * calm_s)
     line.ask(0, read(0))
     for _ in range(20):
         line.run(10.0)
         line.ask(0, read(0))
-    assert window_s(line) == pytest.approx(0.1)
+    assert window_s(line) == pytest.approx(calm_s)
     assert caplog.text.count("event=late_replies_over") == 1
 
 
