@@ -8,6 +8,7 @@ import socket
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from aiohttp import ClientError, ClientSession
@@ -56,7 +57,7 @@ def days() -> Days:
 
 
 @asynccontextmanager
-async def serving(site: Site, clock: ManualClock, days: Days | None, **settings: float) -> AsyncIterator[str]:
+async def serving(site: Site, clock: ManualClock, days: Days | None, **settings: object) -> AsyncIterator[str]:
     """A face with this history; gives the address of its log."""
     chosen = replace(HttpSettings(listen=(("127.0.0.1", 0),)), **settings)  # type: ignore[arg-type]  # replace checks
     face = HttpFace(chosen, site, clock, modbus=ModbusServerStats(), snmp=dict, not_ready=tuple, log=days)
@@ -164,6 +165,17 @@ async def test_a_reader_that_takes_nothing_is_given_up(site: Site, clock: Manual
                 while not days.closed:  # noqa: ASYNC110  # the stub has no event
                     await asyncio.sleep(0.005)
         assert (await get(url, "?device=nobody"))[0] == 404
+
+
+async def test_it_is_guarded_like_everything_else(site: Site, clock: ManualClock, days: Days, tmp_path: Path) -> None:
+    token = tmp_path / "token"
+    token.write_text("a-token-that-is-long-enough\n")
+    token.chmod(0o600)
+    async with serving(site, clock, days, bearer_token_file=str(token)) as url, ClientSession() as session:
+        assert (await get(url))[0] == 401
+        async with session.get(url, headers={"Authorization": "Bearer a-token-that-is-long-enough"}) as reply:
+            assert reply.status == 200
+    assert len(days.asked) == 1
 
 
 async def test_head_says_what_it_would_be(url: str) -> None:
