@@ -9,6 +9,7 @@ from gateway.core.site import Device, LinePort, Site
 LINKS = (
     ("/metrics", "metrics for Prometheus"),
     ("/sd", "this gateway for Prometheus' http_sd_config"),
+    ("/api/v1/log", "the days of the controllers' logs as JSON, where a history is kept"),
     ("/healthz", "answers while the gateway runs"),
     ("/readyz", "answers 200 when everything that is configured listens"),
 )
