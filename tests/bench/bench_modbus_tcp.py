@@ -1,6 +1,8 @@
 """Function 03 × 80 registers from memory: the gateway against libmodbus (C) and pymodbus, one table a load.
 
-    .venv/bin/python tests/bench/bench_modbus_tcp.py [--rounds 5] [--seconds 2] [--loads 64x1 8x16]
+Then what an idle connection costs, and what a flood does to others.
+
+    .venv/bin/python tests/bench/bench_modbus_tcp.py [--rounds 3] [--seconds 1] [--loads 1x1 8x1 64x1 256x1 8x16]
 
 A load is CONNECTIONSxPIPELINED. The servers run one after the other in every round, on one core, the load
 generator (modbus_load.c, compiled here) on another; ratios are taken within a round and their median is
@@ -30,6 +32,13 @@ from pathlib import Path
 HERE = Path(__file__).parent
 UNITS = 8
 START_S = 10.0
+FILLED_S = 1.5  # by then the gateway has something of every unit in memory
+IDLE = 500
+REPLY_BYTES = 9 + 2 * 80
+PACE_S = 0.005
+FLOOD_S = 1.0
+FLOOD_ROUNDS = 5
+FLOOD_DEPTH = 64
 
 
 @dataclass(frozen=True)
@@ -175,6 +184,86 @@ def table(runs: dict[str, list[Run]]) -> str:
     return "\n".join(lines)
 
 
+def resident_kib(pid: int) -> int:
+    """Resident memory of a process."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 1024
+
+
+def request(unit: int) -> bytes:
+    """80 registers from 0 of a unit."""
+    return bytes.fromhex("0001 0000 0006") + bytes((unit,)) + bytes.fromhex("03 0000 0050")
+
+
+def reply(client: socket.socket) -> bytes:
+    """One whole reply."""
+    out = b""
+    while len(out) < REPLY_BYTES and (more := client.recv(REPLY_BYTES - len(out))):
+        out += more
+    return out
+
+
+def idle_table(field: list[Server], cores: tuple[int, int]) -> str:
+    """What connections cost that have asked once and are quiet now."""
+    lines = ["| server | before KiB | with them KiB | KiB a connection |", "|---|---|---|---|"]
+    for server in field:
+        with running(server, cores[0]) as (pid, port), contextlib.ExitStack() as opened:
+            time.sleep(FILLED_S)
+            before = resident_kib(pid)
+            for _ in range(IDLE):
+                client = opened.enter_context(socket.create_connection(("127.0.0.1", port), 5))
+                client.sendall(request(1))
+                reply(client)
+            time.sleep(0.2)
+            after = resident_kib(pid)
+        lines.append(f"| {server.name} | {before:,} | {after:,} | {(after - before) / IDLE:.1f} |")
+    return "\n".join(lines)
+
+
+def paced(port: int, seconds: float) -> list[float]:
+    """Latencies in µs of a client that reads at a steady pace."""
+    took = []
+    with socket.create_connection(("127.0.0.1", port), 5, ("127.0.0.2", 0)) as client:
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            began = time.perf_counter()
+            client.sendall(request(2))
+            if len(reply(client)) != REPLY_BYTES:
+                raise ConnectionError("the paced client got no reply")
+            took.append((time.perf_counter() - began) * 1e6)
+            time.sleep(PACE_S)
+    return took
+
+
+def percentiles(took: list[float]) -> tuple[float, float]:
+    """Median and 99th percentile."""
+    took = sorted(took)
+    return took[len(took) // 2], took[int(0.99 * len(took))]
+
+
+def flood_table(generator: str, gateways: list[Server], cores: tuple[int, int]) -> str:
+    """The paced client alone and beside a flood, with rate limits as they are by default and without."""
+    lines = ["| server | rate limit | p50 alone µs | p99 alone µs | p50 µs | p99 µs | × p99 |", "|" + "---|" * 7]
+    for server in gateways:
+        for limit in ("5000", "0"):
+            limited = Server(server.name, (*server.command, limit))
+            pairs = []
+            with running(limited, cores[0]) as (_, port):
+                time.sleep(FILLED_S)
+                flood = ["taskset", "-c", str(cores[1]), generator, str(port), "1", str(FLOOD_DEPTH), str(2 * FLOOD_S)]
+                for _ in range(FLOOD_ROUNDS):
+                    alone = percentiles(paced(port, FLOOD_S))
+                    with subprocess.Popen([*flood, str(UNITS)], stdout=subprocess.DEVNULL) as process:
+                        time.sleep(FLOOD_S / 4)
+                        pairs.append((alone, percentiles(paced(port, FLOOD_S))))
+                        process.kill()
+            quiet, busy = ([statistics.median(pair[at][i] for pair in pairs) for i in (0, 1)] for at in (0, 1))
+            times = statistics.median(beside[1] / alone[1] for alone, beside in pairs)
+            cells = [limited.name, limit if limit != "0" else "none", *(f"{us:,.0f}" for us in (*quiet, *busy))]
+            lines.append("| " + " | ".join([*cells, f"{times:.2f}"]) + " |")
+    return "\n".join(lines)
+
+
 def where() -> str:
     """Date and machine, without which no figure means anything."""
     processor = platform.machine()
@@ -191,9 +280,10 @@ def where() -> str:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=2.0)
-    parser.add_argument("--loads", nargs="+", default=["64x1", "8x16"], metavar="CONNECTIONSxPIPELINED")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=1.0)
+    loads = ["1x1", "8x1", "64x1", "256x1", "8x16"]
+    parser.add_argument("--loads", nargs="*", default=loads, metavar="CONNECTIONSxPIPELINED")
     options = parser.parse_args()
     for tool in ("gcc", "taskset"):
         if shutil.which(tool) is None:
@@ -210,6 +300,12 @@ def main() -> None:
                 for server in field:
                     runs[server.name].append(measure(generator, server, load, options.seconds, cores))
             say(f"\n{load.connections} connections × {load.depth} under way\n\n{table(runs)}")
+        gateways = [server for server in field if server.name.startswith("gateway")]
+        say(f"\nResident memory of a server with {IDLE} idle connections\n\n{idle_table(field, cores)}")
+        say(
+            f"\nA client that reads once in {PACE_S * 1000:g} ms, alone and beside one that floods with"
+            f" {FLOOD_DEPTH} requests under way, both beside polls\n\n{flood_table(generator, gateways, cores)}"
+        )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""The Modbus TCP face over memory: `gateway_server.py PORT asyncio|uvloop`.
+"""The Modbus TCP face over memory: `gateway_server.py PORT asyncio|uvloop [REQUESTS_PER_S]`.
 
 Everything of the face is on: routing, policy, freshness, snapshots replaced every second as polls do, access
-list, limits, counters, and rate limits, which the load generator would be refused by if they were not set so high.
+list, limits, counters, and rate limits: 10 million requests a second and client, where no other rate is given.
 Only the lines are missing: a read that memory cannot answer is counted as LineDown.
 Register i of every unit holds i.
 """
@@ -52,7 +52,7 @@ class NoLine:
         return self.read(device, pdu, done, client=client)
 
 
-async def serve(port: int) -> None:
+async def serve(port: int, requests_per_s: float) -> None:
     clock = SystemClock()
     line = NoLine()
     devices = [Device(f"unit-{unit}", unit, unit, load_map("prostar-mppt")) for unit in range(1, UNITS + 1)]
@@ -62,7 +62,7 @@ async def serve(port: int) -> None:
         listen=(("127.0.0.1", port),),
         max_connections=1024,
         max_per_client=1024,
-        rate=RateSettings(ClientRate(requests_per_s=1e7), networks=()),
+        rate=RateSettings(ClientRate(requests_per_s), networks=()),
     )
     server = ModbusServer(settings, Site.of("bench", [line], devices), clock, ModbusServerStats())
     data = b"".join(at.to_bytes(2) for at in range(0x52))
@@ -78,9 +78,10 @@ async def serve(port: int) -> None:
 
 
 if __name__ == "__main__":
+    main = serve(int(sys.argv[1]), float(sys.argv[3]) if len(sys.argv) > 3 else 1e7)
     if sys.argv[2] == "uvloop":
         import uvloop
 
-        uvloop.run(serve(int(sys.argv[1])))
+        uvloop.run(main)
     else:
-        asyncio.run(serve(int(sys.argv[1])))
+        asyncio.run(main)

@@ -9,6 +9,7 @@ import socket
 import pytest
 
 from gateway.errors import ListenError
+from gateway.faces.modbus.connection import MAX_WAITING
 from gateway.modbus import mbap
 
 from .conftest import GOOD, GOOD_REPLY, READ_1, Running, Serve, World
@@ -122,6 +123,24 @@ async def test_stopping_lets_requests_under_way_finish(serve: Serve, world: Worl
     await stop
     assert len(line.transactions) == 1
     assert listener.bound is None
+
+
+async def test_stopping_answers_06_to_what_was_not_begun(serve: Serve, world: World) -> None:
+    running = await serve(stop_grace_s=10.0)
+    line = world.line(12)
+    line.held = True
+    client = await running.connect()
+    asked = b"".join(mbap.encode(tid, 12, READ_1) for tid in range(MAX_WAITING + 9))
+    client.send(asked)
+    await running.until(lambda: bool(line.waiting) and len(line.waiting[0].waiters) == MAX_WAITING)
+    stop = asyncio.create_task(running.server.listeners[0].stop())
+    await asyncio.sleep(0)
+    line.release()
+    replies = mbap.MbapSplitter().feed(await client.rest())
+    assert [reply.tid for reply in replies] == list(range(MAX_WAITING + 9))
+    assert [reply.pdu for reply in replies] == [GOOD_REPLY[7:]] * MAX_WAITING + [b"\x83\x06"] * 9
+    await stop
+    assert world.stats.requests == MAX_WAITING + 9
 
 
 async def test_stopping_does_not_wait_for_ever(serve: Serve, world: World) -> None:
