@@ -5,11 +5,15 @@ Both controllers have address 1, as they leave the factory, and are of one model
 
 from __future__ import annotations
 
+import asyncio
 import logging
+from collections.abc import Callable
+from pathlib import Path
 from random import Random
 
 import pytest
 
+from gateway.clock import SystemClock
 from gateway.core.engine import LineEngine
 from gateway.core.requests import Lane
 from gateway.core.settings import LineSettings
@@ -18,8 +22,11 @@ from gateway.core.snapshot import DeviceState
 from gateway.devices.model import DeviceMap
 from gateway.devices.schema import load_map
 from gateway.errors import IdentityUnproven
+from gateway.lines.serial import SerialLine
+from gateway.modbus.rtu import Timing
 from gateway.simulator.device import SimulatedController
 from gateway.simulator.line import SimulatedLine
+from gateway.simulator.pty import PtyLine
 from tests.faults.rig import read
 
 
@@ -137,3 +144,67 @@ def test_a_serial_number_is_enough_to_tell_two_of_the_same_age_apart() -> None:
     for device in pair.devices:
         assert device.snapshot.state is not DeviceState.ONLINE
         assert "identity_mismatch" in device.snapshot.warnings
+
+
+class Socket:
+    """A line of the gateway on a link, and what is plugged in there."""
+
+    def __init__(self, folder: Path, number: int, device_map: DeviceMap) -> None:
+        wire = SimulatedLine([SimulatedController(device_map, seed=3 + number)], timing=Timing.of(115200, 8, "N", 2))
+        self.pty = PtyLine(wire, link=folder / f"socket-{number}")
+        self.device = Device(f"array-{number}", 10 + number, 1, device_map)
+        settings = LineSettings(f"line-{number}", 1 + number, str(self.pty.link), baudrate=115200)
+        self.line = SerialLine(settings, [self.device], SystemClock(), Random(number))
+
+    @property
+    def state(self) -> DeviceState:
+        return self.device.snapshot.state
+
+    @property
+    def mismatch(self) -> bool:
+        return "identity_mismatch" in self.device.snapshot.warnings
+
+
+def swap(one: Socket, other: Socket) -> None:
+    """Pull both adapters and plug each into the other's socket."""
+    one.pty.unplug()
+    other.pty.unplug()
+    one.pty.link, other.pty.link = other.pty.link, one.pty.link
+    one.pty.replug()
+    other.pty.replug()
+
+
+async def test_over_two_ptys(tmp_path: Path) -> None:
+    sockets = [Socket(tmp_path, number, load_map("prostar-mppt")) for number in range(2)]
+    hours: dict[str, object] = {}
+
+    async def until(condition: Callable[[Socket], bool]) -> None:
+        async with asyncio.timeout(30):
+            while not all(map(condition, sockets)):  # the snapshot is replaced without an event
+                for socket in sockets:
+                    shown = socket.device.snapshot.shown().get("hourmeter")
+                    assert shown in {None, hours.get(socket.device.name, shown)}
+                await asyncio.sleep(0.005)
+
+    for socket in sockets:
+        socket.pty.open()
+    tasks = [asyncio.create_task(socket.line.run()) for socket in sockets]
+    try:
+        await until(lambda socket: socket.state is DeviceState.ONLINE)
+        hours = {socket.device.name: socket.device.snapshot.values["hourmeter"] for socket in sockets}
+        assert len(set(hours.values())) == 2
+        swap(*sockets)
+        await until(lambda socket: socket.mismatch)
+        for socket in sockets:
+            assert socket.state is not DeviceState.ONLINE
+            answer: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
+            socket.line.read(socket.device, read(0, 4), answer.set_result)
+            assert isinstance(await answer, IdentityUnproven)
+        swap(*sockets)
+        await until(lambda socket: socket.state is DeviceState.ONLINE and not socket.mismatch)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        for socket in sockets:
+            socket.pty.close()
