@@ -6,7 +6,9 @@ Rule 1: who comes in has shown a certificate that the configured CA stands for, 
 Rule 2: a certificate without a role has the least rights: none, or to read where `require_role` is off (R-23). A role
         that no rule names is no more than that it is one.
 Rule 3: a handshake that fails is counted under its reason, and told once a minute for each peer and reason.
-Rule 4: `reload` takes all files or none. Open connections go on, but those whose certificate is now revoked end.
+Rule 4: a handshake takes as long as `HANDSHAKE_TOKENS` requests from memory, and costs its client as many of its tokens
+        (core/clients.py), or those that it has; who has none is cut off before it begins.
+Rule 5: `reload` takes all files or none. Open connections go on, but those whose certificate is now revoked end.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import ssl
 from cryptography import x509
 
 from gateway.clock import Clock
+from gateway.core.clients import Client
 from gateway.core.log_budget import LogBudget
 from gateway.core.stats import TlsStats
 from gateway.errors import CertificateRefused, TlsFilesError
@@ -29,6 +32,7 @@ from gateway.modbus.role import ROLE_OID, parse_role
 
 logger = logging.getLogger(__name__)
 
+HANDSHAKE_TOKENS = 100
 _OID = x509.ObjectIdentifier(ROLE_OID)
 
 
@@ -53,7 +57,7 @@ class TlsDoor:
             self._use(load(self._settings.files, self._clock.wall()))
 
     def reload(self) -> None:
-        """Take what is on disk now (rule 4)."""
+        """Take what is on disk now (rule 5)."""
         try:
             credentials = load(self._settings.files, self._clock.wall())
         except TlsFilesError as error:
@@ -76,6 +80,10 @@ class TlsDoor:
         )
 
     # What the sessions call (tls_session.Door)
+
+    def affords(self, client: Client) -> bool:
+        """Whether a client may shake hands now (rule 4)."""
+        return client.bucket.take(self._clock.monotonic(), HANDSHAKE_TOKENS) > 0
 
     def context(self) -> ssl.SSLContext:
         """See `Credentials.context`."""

@@ -20,6 +20,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Protocol, cast
 
+from gateway.core.clients import Client
 from gateway.errors import CertificateRefused
 from gateway.faces.modbus.connection import Connection
 
@@ -52,13 +53,17 @@ _SSL_REASONS = {
 }
 REASONS = frozenset(
     {*_VERIFY_REASONS.values(), *_SSL_REASONS.values(), "certificate_invalid", "role_malformed", "refused_by_client"}
-    | {"certificate_unreadable", "timeout", "hung_up", "protocol_error", "internal"}
+    | {"certificate_unreadable", "timeout", "hung_up", "rate_limited", "protocol_error", "internal"}
 )
 """Every label under which a failed handshake is counted."""
 
 
 class Door(Protocol):
     """Who decides on a client that has shown its certificate."""
+
+    def affords(self, client: Client) -> bool:
+        """Whether a client may shake hands now."""
+        ...
 
     def context(self) -> ssl.SSLContext:
         """A context for one connection."""
@@ -214,6 +219,9 @@ class TlsSession(asyncio.Transport, asyncio.Protocol):
     # The way in
 
     def _begin(self) -> None:
+        if not self._door.affords(self.connection.client):
+            self._refuse("rate_limited")
+            return
         self._tls = self._door.context().wrap_bio(self._received, self._to_send, server_side=True)
         self._start_timer(self._handshake_timeout_s)
 

@@ -12,6 +12,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from gateway.core.ratelimit import ClientRate
+from gateway.faces.modbus.settings import RateSettings
 from gateway.faces.modbus.tls_session import _Records
 from gateway.modbus import mbap
 from tests.faces.modbus.conftest import Client, read
@@ -121,6 +123,19 @@ def _first_request(context: ssl.SSLContext, address: tuple[str, int]) -> float:
         sock.sendall(REQUEST)
         assert sock.recv(260)[7:] == REPLY
         return time.perf_counter() - began
+
+
+async def test_f35_a_client_that_only_shakes_hands_is_cut_off_before_it_can(serve_tls: ServeTls) -> None:
+    rate = RateSettings(client=ClientRate(requests_per_s=100.0), burst_s=2.0, networks=())
+    site = await serve_tls(rate=rate)
+    for _ in range(2):
+        await site.connect("reader")
+    for _ in range(3):
+        assert await (await site.running.connect()).rest() == b""
+    assert site.stats.handshakes == 2
+    assert site.stats.refused == {"rate_limited": 3}
+    site.world.clock.now += 2
+    assert await (await site.connect("reader")).query(11, PDU) == REPLY
 
 
 async def test_f49_a_stranger_is_cut_off_before_the_handshake(serve_tls: ServeTls) -> None:
