@@ -8,7 +8,7 @@ Rule 1: a transport calls its protocol as asyncio's do: `connection_made`, any `
         never from within a call of the protocol's own.
 Rule 2: what is written goes to the kernel at once. The rest is kept in order; more than the protocol's limit of
         it pauses the protocol.
-Rule 3: nobody has the loop for long: a turn serves `TURN` events, and takes `READ_BYTES` from each socket.
+Rule 3: nobody has the loop for long: a turn serves `TURN` events, and takes 2.5 kB from each socket.
 Rule 4: a peer that is gone is noticed also while nothing is read from it.
 """
 
@@ -22,6 +22,9 @@ from collections.abc import Callable
 from typing import Any
 
 TURN = 128
+FIRST_BYTES = 448
+"""What Python's own allocator has room for, which is quicker; 37 requests, and mostly there is one."""
+
 READ_BYTES = 2048
 
 _IN = select.EPOLLIN
@@ -81,10 +84,13 @@ class Hub:
             left -= len(ready)
             for fd, events in ready:
                 if events == _IN and (take := takers.get(fd)) is not None:
+                    data = b""
                     try:
-                        data = _read(fd, READ_BYTES)
+                        data = _read(fd, FIRST_BYTES)
+                        if len(data) == FIRST_BYTES:
+                            data += _read(fd, READ_BYTES)
                     except OSError:
-                        data = b""  # the call below meets it again
+                        pass  # nothing more, or the next read meets it again
                     if data:
                         take(data)
                         continue
