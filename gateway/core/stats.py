@@ -55,7 +55,7 @@ class TlsStats:
     handshakes: int = 0  # that let a client in
     refused: Counter[str] = field(default_factory=Counter)  # reason → failed handshakes
     reload_failures: int = 0
-    problem: str = ""  # why the files on disk are not those in use; "" when they are
+    problem: str = ""  # why the files last read cannot be used; "" when they are in use
     not_after: float | None = None  # Unix time when the server's certificate expires; None: there is none yet
 
 

@@ -75,7 +75,9 @@ class Gateway:
         """Why the gateway does not do what its configuration says: listeners not open, files that cannot be used."""
         closed = tuple(f"{label} is not open" for label in self.supervisor.down())
         tls = self._modbus.stats.tls
-        return closed if tls is None or not tls.problem else (*closed, f"modbus tls keeps its old files: {tls.problem}")
+        return (
+            closed if tls is None or not tls.problem else (*closed, f"modbus tls cannot use its files: {tls.problem}")
+        )
 
     def reload(self) -> None:
         """Take certificates, keys and CRLs as they are on disk now, or keep the old ones."""

@@ -53,8 +53,13 @@ class TlsDoor:
 
     def open(self) -> None:
         """Have files to work with; TlsFilesError when they cannot be used."""
-        if self._credentials is None:
+        if self._credentials is not None:
+            return
+        try:
             self._use(load(self._settings.files, self._clock.wall()))
+        except TlsFilesError as error:
+            self._stats.problem = str(error)
+            raise
 
     def reload(self) -> None:
         """Take what is on disk now (rule 5)."""

@@ -116,6 +116,7 @@ async def test_f48_files_that_are_missing_at_the_start_keep_only_the_port_closed
     shutil.move(pki.folder / "server.key", pki.folder / "away")
     with pytest.raises(ListenError, match=r"modbus tls 127.0.0.1:0: key_file: .* cannot be read"):
         await serve_tls()
+    assert "cannot be read" in site.stats.problem
     shutil.move(pki.folder / "away", pki.folder / "server.key")
     assert (await serve_tls()).running.address
 
@@ -202,7 +203,7 @@ def test_f48_sighup_reaches_the_running_gateway(tmp_path: Path) -> None:
         assert serial_at(ports["tls"], context) == serial
         status, shown = get(ports["http"], "/readyz")
         assert status == 503
-        assert "modbus tls keeps its old files: key_file: holds no private key" in shown
+        assert "modbus tls cannot use its files: key_file: holds no private key" in shown
         metrics = get(ports["http"], "/metrics")[1]
         assert "prostar_gateway_modbus_tls_reload_failures_total 1" in metrics
         assert "prostar_gateway_modbus_tls_files_in_use 0" in metrics
