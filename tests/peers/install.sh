@@ -25,6 +25,7 @@ peers=(
   "socat socat"
   "ser2net ser2net"
   "curl curl"
+  "openssl openssl"
   "iproute2 ip"
   "gcc cc"
   "libc6-dev /usr/include/stdio.h"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,8 @@ from gateway.service.settings import line_budgets, modbus_settings
 from gateway.service.tls import tls_problems, tls_settings
 from gateway.service.writes import write_rules
 from tests.faces.modbus.tls.site import SERVER, Pki, run
+
+pytestmark = pytest.mark.peer
 
 MINIMAL = """
 site = "ridge-07"
@@ -37,7 +40,8 @@ client_ca_file = "{0}/ca.pem"
 
 
 @pytest.fixture
-def pki(tmp_path: Path) -> Pki:
+def pki(tmp_path: Path, peer: Callable[[str], str]) -> Pki:
+    peer("openssl")
     return Pki.of_the_recipe(tmp_path / "pki")
 
 

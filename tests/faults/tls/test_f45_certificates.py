@@ -14,6 +14,8 @@ from tests.faces.modbus.conftest import read
 from tests.faces.modbus.tls.conftest import ServeTls, TlsSite
 from tests.faces.modbus.tls.site import SERVER, Pki
 
+pytestmark = pytest.mark.peer
+
 Make = Callable[[Pki], str | None]
 PDU, REPLY = read(11, 0, 4)
 

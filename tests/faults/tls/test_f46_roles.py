@@ -19,6 +19,8 @@ from tests.faces.modbus.tls.conftest import ServeTls, TlsSite
 from tests.faces.modbus.tls.site import Pki, role
 from tests.faces.modbus.writing import MAP, ControllerLine
 
+pytestmark = pytest.mark.peer
+
 PDU, REPLY = read(11, 0, 4)
 WRITE = bytes.fromhex("06 E000 4B64")
 

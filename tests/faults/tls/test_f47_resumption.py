@@ -15,6 +15,8 @@ from tests.faces.modbus.tls.conftest import ServeTls
 from tests.faces.modbus.tls.site import Pki
 from tests.faces.modbus.tls.test_tls_serving import s_client
 
+pytestmark = pytest.mark.peer
+
 PDU, REPLY = read(11, 0, 4)
 V12, V13 = ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3
 
@@ -32,7 +34,6 @@ def _ask(
         return sock.session, sock.session_reused
 
 
-@pytest.mark.peer
 @pytest.mark.parametrize("version", ["-tls1_2", "-tls1_3"])
 @pytest.mark.parametrize("tickets", [(), ("-no_ticket",)])
 async def test_f47_a_client_that_tries_to_resume_shakes_hands_in_full(

@@ -21,6 +21,8 @@ from tests.faces.modbus.conftest import Client, read
 from tests.faces.modbus.tls.conftest import ServeTls
 from tests.faces.modbus.tls.site import SERVER, Pki
 
+pytestmark = pytest.mark.peer
+
 PDU, REPLY = read(11, 0, 4)
 
 
@@ -178,8 +180,7 @@ def get(port: int, path: str) -> tuple[int, str]:
             return error.code, error.read().decode()
 
 
-def test_f48_sighup_reaches_the_running_gateway(tmp_path: Path) -> None:
-    pki = Pki.of_the_recipe(tmp_path / "pki")
+def test_f48_sighup_reaches_the_running_gateway(tmp_path: Path, pki: Pki) -> None:
     config = tmp_path / "site.toml"
     config.write_text(CONFIG.format(folder=tmp_path))
     program = Program([*GATEWAY, "run", "-c", str(config)])

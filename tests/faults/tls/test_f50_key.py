@@ -8,6 +8,7 @@ import signal
 import subprocess
 from pathlib import Path
 
+import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
@@ -15,6 +16,8 @@ from gateway.service.config import load_config
 from tests.e2e.programs import GATEWAY, REPOSITORY, Program
 from tests.faces.modbus.tls.site import Pki
 from tests.faults.tls.test_f48_reload import CONFIG, get, serial_at
+
+pytestmark = pytest.mark.peer
 
 
 def traces(pem: Path) -> set[str]:
@@ -28,8 +31,7 @@ def traces(pem: Path) -> set[str]:
     return {*lines, str(number), f"{number:x}", repr(secret)[2:-1], base64.b64encode(secret).decode()}
 
 
-def test_f50_the_key_shows_nowhere(tmp_path: Path) -> None:
-    pki = Pki.of_the_recipe(tmp_path / "pki")
+def test_f50_the_key_shows_nowhere(tmp_path: Path, pki: Pki) -> None:
     config = tmp_path / "site.toml"
     config.write_text(CONFIG.format(folder=tmp_path))
     given: list[str] = [repr(load_config(config)), str(load_config(config))]

@@ -18,7 +18,8 @@ from tests.faces.modbus.tls.site import Pki
 
 
 @pytest.fixture
-def pki(tmp_path: Path) -> Pki:
+def pki(tmp_path: Path, peer: Callable[[str], str]) -> Pki:
+    peer("openssl")
     return Pki.of_the_recipe(tmp_path / "pki")
 
 

@@ -19,6 +19,8 @@ from gateway.modbus import mbap
 from tests.faces.modbus.conftest import Client, read
 from tests.faces.modbus.tls.conftest import ServeTls, TlsSite
 
+pytestmark = pytest.mark.peer
+
 PDU, REPLY = read(11, 0, 4)
 REQUEST = mbap.encode(1, 11, PDU)
 

@@ -15,6 +15,8 @@ from gateway.modbus import mbap
 from tests.faces.modbus.conftest import Serve, read, register, registers
 from tests.faces.modbus.tls.conftest import ServeTls, TlsSite
 
+pytestmark = pytest.mark.peer
+
 V12, V13 = ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3
 
 
@@ -89,7 +91,6 @@ REQUEST = mbap.encode(7, 11, read(11, 0, 40)[0])
 REPLY = mbap.encode(7, 11, read(11, 0, 40)[1])
 
 
-@pytest.mark.peer
 @pytest.mark.parametrize(
     "options",
     [
@@ -109,7 +110,6 @@ async def test_openssl_s_client_reads(
     assert got == REPLY, said
 
 
-@pytest.mark.peer
 async def test_what_the_handshake_agrees_on(serve_tls: ServeTls, peer: Callable[[str], str]) -> None:
     site = await serve_tls()
     _, said = await s_client(site, peer("openssl"), "-tls1_2")
@@ -121,7 +121,6 @@ async def test_what_the_handshake_agrees_on(serve_tls: ServeTls, peer: Callable[
     assert "New, TLSv1.2, Cipher is ECDHE-ECDSA-AES" in said
 
 
-@pytest.mark.peer
 async def test_f45_a_client_that_expects_another_server_does_not_talk(
     serve_tls: ServeTls, peer: Callable[[str], str]
 ) -> None:
@@ -133,7 +132,6 @@ async def test_f45_a_client_that_expects_another_server_does_not_talk(
     assert site.world.stats.requests == 0
 
 
-@pytest.mark.peer
 async def test_rsa_keys_do_with_the_mandatory_suite(
     serve_tls: ServeTls, peer: Callable[[str], str], pki_rsa: None
 ) -> None:
