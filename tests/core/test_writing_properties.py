@@ -87,7 +87,7 @@ REQUESTS = st.tuples(
 )
 
 
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(requests=st.lists(REQUESTS, min_size=8, max_size=25))
 def test_whatever_happens(requests: list[tuple[int, list[int], list[str | None], float]]) -> None:
     bench = Chaos()
