@@ -15,7 +15,7 @@ import pytest
 from gateway.faces.modbus import tcp
 from tests.faces.modbus.conftest import GOOD, READ_80, Running, Serve, World
 
-HERE, THERE = "198.18.77.1", "198.18.77.2"  # for measurements between devices (RFC 2544)
+NETWORK = ip_network("198.18.0.0/15")  # for measurements between devices (RFC 2544)
 CLIENT = """
 import socket, sys
 client = socket.create_connection((sys.argv[1], int(sys.argv[2])), 10)
@@ -50,6 +50,8 @@ class Cable:
         self._ip = ip
         self.name = f"pgw{os.getpid()}"
         self.near, self.far = f"{self.name}a", f"{self.name}b"
+        first = NETWORK[4 * (os.getpid() % (NETWORK.num_addresses // 4))]  # tests run side by side, each in its /30
+        self.here, self.there = str(first + 1), str(first + 2)
 
     def run(self, *arguments: str) -> None:
         subprocess.run([self._ip, *arguments], check=True, capture_output=True, text=True)
@@ -57,9 +59,9 @@ class Cable:
     def plug_in(self) -> None:
         self.run("netns", "add", self.name)
         self.run("link", "add", self.near, "type", "veth", "peer", "name", self.far, "netns", self.name)
-        self.run("addr", "add", f"{HERE}/30", "dev", self.near)
+        self.run("addr", "add", f"{self.here}/30", "dev", self.near)
         self.run("link", "set", self.near, "up")
-        self.run("-n", self.name, "addr", "add", f"{THERE}/30", "dev", self.far)
+        self.run("-n", self.name, "addr", "add", f"{self.there}/30", "dev", self.far)
         self.run("-n", self.name, "link", "set", self.far, "up")
 
     def cut(self) -> None:
@@ -105,11 +107,11 @@ def within_s(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 async def test_its_place_is_free_again(
     serve: Serve, world: World, cable: Cable, within_s: int, unacknowledged: bool
 ) -> None:
-    running = await serve(listen=((HERE, 0),), allow=(ip_network(f"{THERE}/32"),))
+    running = await serve(listen=((cable.here, 0),), allow=(ip_network(f"{cable.there}/32"),))
     world.poll(12)
     line = world.line(11)
     line.held = True
-    command = ("ip", "netns", "exec", cable.name, sys.executable, "-c", CLIENT, HERE, str(running.address[1]))
+    command = ("ip", "netns", "exec", cable.name, sys.executable, "-c", CLIENT, cable.here, str(running.address[1]))
     waits = GOOD[:6] + bytes((11,)) + READ_80 if unacknowledged else b""
     client = await asyncio.create_subprocess_exec(
         *command, (GOOD + waits).hex(), stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
