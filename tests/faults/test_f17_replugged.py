@@ -24,7 +24,9 @@ async def test_it_is_opened_again_by_its_link_after_a_settling_time_with_fresh_d
         first_name = line.device_path
         line.pty.unplug()
         await line.until(lambda: not line.up and not Path(first_name).exists())
-        spare = os.openpty()  # takes the old number, so that the adapter comes back under another name
+        spare: list[int] = []  # take the old number, so that the adapter comes back under another name
+        while not Path(first_name).exists():
+            spare += os.openpty()
         try:
             requests = line.wire.counters.requests
             line.pty.open()

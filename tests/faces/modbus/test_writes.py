@@ -212,8 +212,8 @@ async def test_an_outcome_that_could_not_be_noted_follows(tmp_path: Path, monkey
         with full_disk(monkeypatch, after=0):
             it.line.release()
             assert await it.answer() == "050001ff00"
+            assert it.fates() == [None]
         it.line.held = False
-        assert it.fates() == [None]
         assert await it.query("05 0002 ff00") == "050002ff00"
         await it.until(lambda: it.fates() == [Fate.WRITTEN, Fate.WRITTEN])
 

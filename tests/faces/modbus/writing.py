@@ -43,13 +43,16 @@ RULE = WriteRule(
     points=frozenset({"reset_control"}),
 )
 
+WALL_OFFSET_S = 1.8e9
+"""From the monotonic to the wall clock: 2027."""
+
 
 class Clock:
     """Time that only a test moves; both clocks step together unless told otherwise."""
 
     def __init__(self) -> None:
         self.now = 1000.0
-        self.wall_offset_s = 1.8e9
+        self.wall_offset_s = WALL_OFFSET_S
 
     def monotonic(self) -> float:
         return self.now
@@ -226,10 +229,12 @@ async def writing(
     on: bool = True,
     rate: RateSettings = NO_LIMITS,
     line: ControllerLine | None = None,
+    wall_offset_s: float = WALL_OFFSET_S,
 ) -> AsyncIterator[Writing]:
     """A face on a free port with one client; units 11 and 12 are addresses 1 and 2 of one line, both online."""
     line = line or ControllerLine()
     clock, stats = Clock(), ModbusServerStats()
+    clock.wall_offset_s = wall_offset_s
     devices = [
         Device(f"array-{address}", 10 + address, address, MAP, snapshot=Snapshot(state=DeviceState.ONLINE))
         for address in line.units

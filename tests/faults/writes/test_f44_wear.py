@@ -8,7 +8,7 @@ import pytest
 
 from gateway.core.write_ledger import Fate
 from gateway.faces.modbus.settings import RateSettings
-from tests.faces.modbus.writing import writing
+from tests.faces.modbus.writing import WALL_OFFSET_S, writing
 
 
 async def test_a_value_that_is_there_already_costs_the_eeprom_nothing(tmp_path: Path) -> None:
@@ -37,12 +37,10 @@ async def test_the_budget_survives_a_restart_and_wrong_clocks(tmp_path: Path) ->
         line = it.line
         assert await it.query("06 e000 4b01") == "06e0004b01"
         assert await it.query("06 e000 4b02") == "06e0004b02"
-    for wall_offset_s in (1.8e9 + 3600, 1.8e9 - 10 * 86_400):
-        async with writing(tmp_path, per_day=2, line=line) as it:
-            it.clock.wall_offset_s = wall_offset_s
+    for wall_offset_s in (WALL_OFFSET_S + 3600, WALL_OFFSET_S - 10 * 86_400):
+        async with writing(tmp_path, per_day=2, line=line, wall_offset_s=wall_offset_s) as it:
             assert await it.query("06 e000 4b03") == "8606"
-    async with writing(tmp_path, per_day=2, line=line) as it:
-        it.clock.wall_offset_s += 2 * 86_400
+    async with writing(tmp_path, per_day=2, line=line, wall_offset_s=WALL_OFFSET_S + 2 * 86_400) as it:
         assert await it.query("06 e000 4b03") == "06e0004b03"
         it.clock.wall_offset_s += 365 * 86_400  # a step while it runs changes nothing
         assert await it.query("06 e000 4b04") == "06e0004b04"
