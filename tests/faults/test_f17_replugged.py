@@ -18,15 +18,21 @@ from tests.faults.pty_rig import running
 from tests.faults.rig import read
 
 
+def take_name(device_path: str) -> list[int]:
+    """Open ptys until one has that name, so that the adapter comes back under another one."""
+    held: list[int] = []
+    while not Path(device_path).exists():
+        held += os.openpty()
+    return held
+
+
 async def test_it_is_opened_again_by_its_link_after_a_settling_time_with_fresh_data(tmp_path: Path) -> None:
     async with running(tmp_path, poll=PollSettings(live_s=0.2)) as line:
         await line.until(lambda: line.devices[0].snapshot.state is DeviceState.ONLINE)
         first_name = line.device_path
         line.pty.unplug()
         await line.until(lambda: not line.up and not Path(first_name).exists())
-        spare: list[int] = []  # take the old number, so that the adapter comes back under another name
-        while not Path(first_name).exists():
-            spare += os.openpty()
+        spare = take_name(first_name)
         try:
             requests = line.wire.counters.requests
             line.pty.open()
