@@ -3,7 +3,7 @@
 Rule 1: a port with a file descriptor (a device, `socket://`) is on the event loop; one without (`rfc2217://`) has a
         thread that reads and one that writes.
 Rule 2: the port is looked at when bytes are due, not at each byte: the reader sleeps until the awaited reply can be
-        whole, one character early. A reply of 170 bytes costs a few wake-ups.
+        whole, a little early. A reply of 170 bytes costs a few wake-ups.
 Rule 3: whatever goes wrong is told once, as the line's failure; after that nothing is read any more, for a dead
         descriptor is readable for ever.
 """
@@ -27,6 +27,8 @@ T = TypeVar("T")
 READ_BYTES = 512
 LONGEST_PAUSE_S = 0.25
 """How long the reader may sleep: a port that was unplugged meanwhile is noticed after that."""
+LATE_S = 0.001
+"""By how much asyncio's timers may be late."""
 SHORTEST_PAUSE_S = 0.002
 """A shorter sleep costs more than the wake-ups it saves."""
 THREAD_READ_S = 0.1
@@ -165,7 +167,7 @@ class FileTransport:
             self._sleep_until(self._whole_at)
 
     def _sleep_until(self, whole_at: float) -> None:
-        pause_s = min(whole_at - self._char_s - self._loop.time(), LONGEST_PAUSE_S)
+        pause_s = min(whole_at - self._char_s - LATE_S - self._loop.time(), LONGEST_PAUSE_S)
         if pause_s < SHORTEST_PAUSE_S or self._ended:
             return
         if self._pause is None:
