@@ -1,8 +1,9 @@
 """Whose turn it is on a line.
 
 Rule 1: lanes by precedence: slave control, other writes, client reads, polls, background (requests.Lane).
-Rule 2: ageing, so that no lane starves: a lane whose head has waited longer than the lane's patience (a poll: a
-        whole period) goes next after one turn of a higher lane; of several such lanes the one passed over most.
+Rule 2: ageing, so that no lane starves: a lane whose head has waited longer than the lane's patience goes next
+        after one turn of a higher lane; of several such lanes the one passed over most. Polls have no patience with
+        clients: one that is due waits for one read of theirs at most. For writes it waits a whole period.
 Rule 3: of the polls, the one that was due first goes first; after its turn it is due one period after it was
         started, so that on a line too slow for its polls all periods stretch alike, and a pause (suspend, a line
         that was down) is followed by one round, not by a burst.
@@ -137,7 +138,7 @@ class Scheduler:
             ready[Lane.CLIENT] = max(client.queued_at, self._served_at[Lane.CLIENT]) + PATIENCE_S[Lane.CLIENT]
         poll = self._due_poll(now)
         if poll is not None:
-            ready[Lane.POLL] = poll[0] + (poll[1].period_s or 0.0)
+            ready[Lane.POLL] = poll[0]
         background = self._background.head()
         if background is not None:
             due = self._next_poll_due()
@@ -146,7 +147,7 @@ class Scheduler:
                 ready[Lane.BACKGROUND] = aged_at
         if not ready:
             return None
-        lane = self._choose(ready, now)
+        lane = self._choose(ready, now, poll_grace_s=(poll[1].period_s or 0.0) if poll is not None else 0.0)
         self._served_at[lane] = now
         if lane in self._writes:
             return self._writes[lane].popleft()
@@ -157,7 +158,7 @@ class Scheduler:
         assert head is not None
         return self._join(head)
 
-    def _choose(self, ready: dict[Lane, float], now: float) -> Lane:
+    def _choose(self, ready: dict[Lane, float], now: float, *, poll_grace_s: float) -> Lane:
         """Rules 1 and 2."""
         first = min(ready)
         aged = [lane for lane, at in ready.items() if at <= now and self._passed[lane] > 0]
@@ -165,7 +166,8 @@ class Scheduler:
         if first is Lane.SLAVE_CONTROL and self._passed[chosen] < SLAVE_TURNS:
             chosen = first
         for lane, at in ready.items():
-            if lane > chosen and at <= now:
+            grace_s = poll_grace_s if lane is Lane.POLL and chosen < Lane.CLIENT else 0.0
+            if lane > chosen and at + grace_s <= now:
                 self._passed[lane] += 1
         self._passed[chosen] = 0
         return chosen

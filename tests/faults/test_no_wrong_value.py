@@ -52,10 +52,11 @@ def test_under_all_faults_at_once(seed: int, rate: float) -> None:
 @pytest.mark.parametrize("fault", sorted(LINE_FAULTS))
 def test_under_one_kind_of_fault(fault: Fault) -> None:
     rate = 0.04 if fault in {Fault.LATE, Fault.SILENCE} else 0.15  # these cost seconds each
-    rig = storm(Chaos(1, {fault: rate}), 150)
-    assert sum(rig.outcomes.values()) == 150
-    assert rig.outcomes["reply"] > 25
-    assert rig.chaos.counts[fault] > 4
+    storms = [storm(Chaos(seed, {fault: rate}), 150) for seed in range(1, 5)]
+    assert [sum(rig.outcomes.values()) for rig in storms] == [150] * 4
+    # How much one storm brings depends on whose turn it was when a fault fell; four together show that it was one.
+    assert sum(rig.outcomes["reply"] for rig in storms) > 100
+    assert sum(rig.chaos.counts[fault] for rig in storms) > 20
 
 
 @given(
@@ -72,40 +73,51 @@ def test_under_any_mixture(seed: int, rates: dict[Fault, float], late_s: float, 
 def wrong_value(seed: int) -> AssertionError | None:
     """The first wrong value under late and lost replies, or None."""
     try:
-        storm(Chaos(seed, {Fault.LATE: 0.05, Fault.DROP: 0.05}), 150)
+        storm(Chaos(seed, {Fault.LATE: 0.05, Fault.DROP: 0.05}), 300)
     except AssertionError as error:
         return error
     return None
 
 
 def test_without_the_settling_question_late_replies_are_taken_for_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the rule is for, and that these tests would see it missing."""
-    assert [wrong_value(seed) for seed in range(8)] == [None] * 8
-    monkeypatch.setattr(Doubt, "allows", lambda _self, _function: True)
-    errors = {seed: error for seed in range(8) if (error := wrong_value(seed)) is not None}
-    assert len(errors) >= 3
-    for seed, error in errors.items():
+    """What the rule is for, and that these tests would see it missing.
+
+    About one storm in five meets what the rule is against; which one depends on whose turn it was. So they are
+    searched for without the rule, and the same storms are harmless with it.
+    """
+    harmful: dict[int, AssertionError] = {}
+    with monkeypatch.context() as without:
+        without.setattr(Doubt, "allows", lambda _self, _function: True)
+        for seed in range(100):
+            error = wrong_value(seed)
+            if error is not None:
+                harmful[seed] = error
+            if len(harmful) == 4:
+                break
+    assert len(harmful) == 4
+    for seed, error in harmful.items():
         assert str(error).startswith(("late", "foreign", "torn"))
         assert f"chaos seed={seed} " in error.__notes__[0]
+    assert [wrong_value(seed) for seed in harmful] == [None] * 4
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_a_write_that_succeeded_was_made_and_none_is_made_twice(seed: int) -> None:
+def test_a_write_that_succeeded_was_made_and_none_is_made_twice() -> None:
     """Always the same write, so that a late answer to one fits the next."""
     kinds = dict.fromkeys(LINE_FAULTS - {Fault.ECHO, Fault.SILENCE}, 0.03)
-    rig = make_rig(Unit(0), medium=Chaos(seed, kinds), poll=POLL, writes=True)
-    made = rig.units[0].writes
     succeeded = 0
-    for _ in range(100):
-        before = len(made)
-        outcome = rig.write(0, WRITE)
-        assert len(made) - before <= 1
-        if outcome == WRITE:
-            succeeded += 1
-            assert len(made) == before + 1
-        rig.run(0.3)
-    assert succeeded > 10
-    rig.account()
+    for seed in range(8):
+        rig = make_rig(Unit(0), medium=Chaos(seed, kinds), poll=POLL, writes=True)
+        made = rig.units[0].writes
+        for _ in range(100):
+            before = len(made)
+            outcome = rig.write(0, WRITE)
+            assert len(made) - before <= 1, rig.chaos.report()
+            if outcome == WRITE:
+                succeeded += 1
+                assert len(made) == before + 1, rig.chaos.report()
+            rig.run(0.3)
+        rig.account()
+    assert succeeded > 100
 
 
 async def test_over_a_pty(tmp_path: Path) -> None:
