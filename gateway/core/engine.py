@@ -31,12 +31,12 @@ from gateway.core.budget import read_s
 from gateway.core.coalescing import part
 from gateway.core.device_record import DeviceRecord
 from gateway.core.health import Breaker
-from gateway.core.polling import IDENTITY_MISMATCH, Polling
+from gateway.core.polling import Polling
 from gateway.core.requests import ClientRead, Lane, PollItem, Purpose, ReadTurn, Span, Turn, Waiter, WriteTurn
 from gateway.core.scheduler import PollList, Scheduler
 from gateway.core.settings import LineSettings
 from gateway.core.site import Device, LineState, LineStatus, Outcome
-from gateway.core.snapshot import DeviceState
+from gateway.core.snapshot import IDENTITY_MISMATCH, DeviceState
 from gateway.core.stats import LineStats
 from gateway.devices.model import Point
 from gateway.errors import (

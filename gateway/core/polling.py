@@ -22,7 +22,7 @@ from gateway.core.health import MISSES_TO_OPEN
 from gateway.core.requests import PollItem, Purpose
 from gateway.core.settings import LineSettings
 from gateway.core.site import Device
-from gateway.core.snapshot import Block, DeviceState
+from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN, Block, DeviceState
 from gateway.devices.model import Identification, PollClass, Space
 from gateway.devices.plan import PlannedBlock, poll_plan, split
 from gateway.modbus.pdu import Function, ReadRequest, parse_identification, read_identification_request
@@ -32,8 +32,6 @@ log = logging.getLogger(__name__)
 
 LOOK_AGAIN_S = 60.0
 REWRITE_WARNING_SHARE = 0.75
-IDENTITY_MISMATCH = "identity_mismatch"
-NOT_REWRITTEN = "slave_control_not_refreshed"
 _REFUSALS_TO_SPLIT = (0x02, 0x03)
 _SMOOTHING = 0.3
 

@@ -14,6 +14,10 @@ from types import MappingProxyType
 
 from gateway.devices.model import Identification, Space, Value
 
+IDENTITY_MISMATCH = "identity_mismatch"
+NOT_REWRITTEN = "slave_control_not_refreshed"
+"""Of `Snapshot.warnings`: another unit answers; a value that must be written again and again was not in time."""
+
 
 class DeviceState(StrEnum):
     """Quality of everything a device shows (design §7)."""
@@ -56,7 +60,7 @@ class Snapshot:
     read_at: Mapping[str, float] = field(default_factory=lambda: _NO_TIMES)  # point name → its block's read_at
     identification: Identification | None = None
     serial_number: str | None = None
-    warnings: frozenset[str] = frozenset()  # conditions that the gateway itself sees, such as "identity_mismatch"
+    warnings: frozenset[str] = frozenset()  # conditions that the gateway itself sees
 
     def shown(self) -> Mapping[str, Value]:
         """Values that a face may show now: all of an online device, none of any other."""

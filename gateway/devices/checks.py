@@ -161,6 +161,40 @@ def _rules(device_map: DeviceMap) -> Iterator[str]:
             yield f"point {point.name}: what restarts the device is named_only"
 
 
+def _conditions(device_map: DeviceMap) -> Iterator[str]:
+    firsts: dict[int, str] = {}
+    names: dict[str, str] = {}
+    for point in device_map.points:
+        rule = point.conditions
+        if rule is None:
+            if point.bits is not None and point.group is Group.LIVE:
+                yield f"point {point.name}: conditions: live bits need them, such as {{ first = 100, name = … }}"
+            continue
+        if point.bits is None or point.group is not Group.LIVE:
+            yield f"point {point.name}: conditions: are for live bits"
+        if rule.first % 100:
+            yield f"point {point.name}: conditions: first {rule.first}; allowed: 100, 200, 300"
+        if firsts.setdefault(rule.first, point.name) != point.name:
+            yield f"point {point.name}: conditions: first {rule.first} belongs to {firsts[rule.first]}"
+        if names.setdefault(rule.name, point.name) != point.name:
+            yield f"point {point.name}: conditions: name {rule.name} belongs to {names[rule.name]}"
+
+
+def _load(device_map: DeviceMap) -> Iterator[str]:
+    load = device_map.load
+    if load is None:
+        return
+    point = next((point for point in device_map.points if point.polled and point.name == load.point), None)
+    if point is None or point.enumeration is None:
+        yield f"load: no polled enumeration {load.point}"
+        return
+    known = {value.number for value in device_map.enumerations.get(point.enumeration, ())}
+    for number in sorted((load.disconnected | load.connected) - known):
+        yield f"load: {number} is no value of {load.point}"
+    for number in sorted(load.disconnected & load.connected):
+        yield f"load: {number} is both connected and disconnected"
+
+
 def _number_tables(device_map: DeviceMap) -> Iterator[str]:
     for kind, tables in (("enumeration", device_map.enumerations), ("bits", device_map.bit_tables)):
         for name, entries in tables.items():
@@ -248,6 +282,8 @@ _CHECKS: tuple[Callable[[DeviceMap], Iterator[str]], ...] = (
     _places,
     _points,
     _rules,
+    _conditions,
+    _load,
     _number_tables,
     _mib,
     _metrics,

@@ -97,6 +97,14 @@ class MibColumn:
 
 
 @dataclass(frozen=True, slots=True)
+class BitConditions:
+    """Each bit of a point is a condition: its number there is `first` + the bit's, its name begins with `name`."""
+
+    first: int
+    name: str  # snake_case: array_fault
+
+
+@dataclass(frozen=True, slots=True)
 class Point:
     """A named value of a device.
 
@@ -129,6 +137,7 @@ class Point:
     restarts: bool = False  # a write restarts the device, which then does not answer: silence is success
     named_only: bool = False  # to be written only where its very name was allowed, never as one of a range
     wears: bool = False  # a write makes the device write its own EEPROM
+    conditions: BitConditions | None = None  # what its bits are to core/conditions.py
 
     @property
     def polled(self) -> bool:
@@ -213,6 +222,18 @@ class NightRule:
 
 
 @dataclass(frozen=True, slots=True)
+class LoadRule:
+    """The values of a point that mean that the device keeps the load disconnected, and those that it is connected.
+
+    Any other value (switched off by somebody, starting) tells neither.
+    """
+
+    point: str
+    disconnected: frozenset[int]
+    connected: frozenset[int]
+
+
+@dataclass(frozen=True, slots=True)
 class IdentityRules:
     """How the model shows itself: Read Device Identification and an optional serial number."""
 
@@ -241,6 +262,7 @@ class DeviceMap:
     log: LogLayout | None
     identity: IdentityRules
     night: NightRule | None = None
+    load: LoadRule | None = None
 
     def covers(self, space: Space, first: int, end: int) -> bool:
         """Whether every address from `first` to one before `end` lies in an extent."""

@@ -20,12 +20,14 @@ from gateway.devices.checks import problems_of
 from gateway.devices.model import (
     Access,
     Bit,
+    BitConditions,
     DeviceMap,
     EnumValue,
     Extent,
     Group,
     Growing,
     IdentityRules,
+    LoadRule,
     LogField,
     LogLayout,
     MibColumn,
@@ -99,6 +101,14 @@ class _Mib(_Form):
         return MibColumn(self.column, self.scale, self.units, self.syntax)
 
 
+class _Conditions(_Form):
+    first: Annotated[int, Field(ge=100, le=300)]
+    name: Label
+
+    def build(self) -> BitConditions:
+        return BitConditions(self.first, self.name)
+
+
 class _Point(_Form):
     name: Label
     space: SpaceName = "registers"
@@ -127,6 +137,7 @@ class _Point(_Form):
     restarts: bool = False
     named_only: bool = False
     wears: bool = False
+    conditions: _Conditions | None = None
     mib: _Mib | None = None
     metric: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")] | None = None
     metric_scale: Number = 1
@@ -172,6 +183,7 @@ class _Point(_Form):
             restarts=self.restarts,
             named_only=self.named_only,
             wears=self.wears,
+            conditions=None if self.conditions is None else self.conditions.build(),
         )
 
 
@@ -228,6 +240,15 @@ class _Night(_Form):
     value: int
 
 
+class _Load(_Form):
+    point: Label
+    disconnected: tuple[int, ...] = Field(strict=False)
+    connected: tuple[int, ...] = Field(strict=False)
+
+    def build(self) -> LoadRule:
+        return LoadRule(self.point, frozenset(self.disconnected), frozenset(self.connected))
+
+
 class _Identity(_Form):
     vendor: Text
     product_prefixes: tuple[Text, ...] = Field(strict=False)
@@ -258,6 +279,7 @@ class _File(_Form):
     write_functions: dict[FunctionCode, SpaceName] = {}
     identity: _Identity
     night: _Night | None = None
+    load: _Load | None = None
     extent: tuple[_Extent, ...] = Field(strict=False)
     reserved: tuple[_Extent, ...] = Field(default=(), strict=False)
     enumeration: dict[Label, Annotated[tuple[_EnumValue, ...], Field(strict=False)]] = {}
@@ -290,6 +312,7 @@ class _File(_Form):
             log=None if self.log is None else self.log.build(),
             identity=self.identity.build(),
             night=NightRule(self.night.point, self.night.value) if self.night is not None else None,
+            load=None if self.load is None else self.load.build(),
         )
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from gateway.errors import MapError
 from gateway.faces.snmp.layout import Layout, shipped_layout
-from gateway.faces.snmp.objects import Convention, ObjectType, ScalarGroup, Syntax, Table
+from gateway.faces.snmp.objects import Convention, Index, ObjectType, ScalarGroup, Syntax, Table
 from gateway.faces.snmp.settings import DEFAULT_ROOT, Oid
 
 REG = "PROSTAR-GATEWAY-REG-MIB"
@@ -220,7 +220,11 @@ def _scalars(group: ScalarGroup) -> Iterator[str]:
 def _table(table: Table) -> Iterator[str]:
     entry = f"{table.name}Entry"
     row = entry[:1].upper() + entry[1:]
-    own_index = table.index_of is None
+    own = table.indexes
+    if not own and table.index_of is None:
+        about = "Unit id of the device." if table.index.endswith("UnitId") else "Position in the configuration."
+        own = (Index(1, table.index, 1, 247 if table.index.endswith("UnitId") else 65535, about),)
+    named = ", ".join(([] if table.index_of is None else [table.index]) + [each.name for each in own])
     yield (
         f"{table.name}Table OBJECT-TYPE\n"
         f"    SYNTAX      SEQUENCE OF {row}\n"
@@ -235,22 +239,20 @@ def _table(table: Table) -> Iterator[str]:
         "    MAX-ACCESS  not-accessible\n"
         "    STATUS      current\n"
         f"    DESCRIPTION\n{_text(f'A row of {table.name}Table.')}\n"
-        f"    INDEX       {{ {table.index} }}\n"
+        f"    INDEX       {{ {named} }}\n"
         f"    ::= {{ {table.name}Table 1 }}\n"
     )
-    fields = [(table.index, "Unsigned32")] if own_index else []
+    fields = [(each.name, "Unsigned32") for each in own]
     fields += [(each.name, "BITS" if _syntax(each) == "Bits" else _syntax(each)) for each in table.columns]
     yield f"{row} ::= SEQUENCE {{\n" + ",\n".join(f"    {name:<32} {syntax}" for name, syntax in fields) + "\n}\n"
-    if own_index:
-        about = "Unit id of the device." if table.index.endswith("UnitId") else "Position in the configuration."
-        upper = 247 if table.index.endswith("UnitId") else 65535
+    for index in own:
         yield (
-            f"{table.index} OBJECT-TYPE\n"
-            f"    SYNTAX      Unsigned32 (1..{upper})\n"
+            f"{index.name} OBJECT-TYPE\n"
+            f"    SYNTAX      Unsigned32 ({index.least}..{index.most})\n"
             "    MAX-ACCESS  not-accessible\n"
             "    STATUS      current\n"
-            f"    DESCRIPTION\n{_text(about)}\n"
-            f"    ::= {{ {entry} 1 }}\n"
+            f"    DESCRIPTION\n{_text(index.description)}\n"
+            f"    ::= {{ {entry} {index.number} }}\n"
         )
     for each in table.columns:
         yield _object(each, entry)

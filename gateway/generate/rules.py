@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from gateway.core.polling import IDENTITY_MISMATCH, NOT_REWRITTEN
+from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN
 from gateway.devices.model import DeviceMap, Group, Point
 from gateway.devices.schema import load_map, models
 from gateway.generate.yaml import Node, dump

@@ -26,6 +26,7 @@ from gateway.history.keeper import HistoryKeeper
 from gateway.history.source import HistorySource
 from gateway.lines.serial import SerialLine
 from gateway.service.advice import advice
+from gateway.service.conditions import ConditionKeeper
 from gateway.service.config import Config
 from gateway.service.settings import (
     history_settings,
@@ -36,7 +37,7 @@ from gateway.service.settings import (
     modbus_settings,
 )
 from gateway.service.snmp import snmp_settings
-from gateway.service.supervisor import Listener, Supervisor
+from gateway.service.supervisor import Listener, Runnable, Supervisor
 
 _log = logging.getLogger(__name__)
 
@@ -53,9 +54,13 @@ class Gateway:
         self.site = Site.of(config.site, self.lines, [device for group in groups for device in group])
         stats = ModbusServerStats()
         self._modbus = modbus = ModbusServer(modbus_settings(config), self.site, clock, stats)
-        snmp = SnmpAgent(snmp_settings(config), self.site, clock, stats)
         history = HistoryStats() if config.history.enabled else None
         kept = history_settings(config)
+        watching = ConditionKeeper(
+            self.site, clock, not_ready=self.not_ready, history=history, state_dir=kept.directory
+        )
+        self.conditions = watching.conditions
+        snmp = SnmpAgent(snmp_settings(config), self.site, clock, stats, conditions=self.conditions)
         http = HttpFace(
             http_settings(config),
             self.site,
@@ -67,7 +72,8 @@ class Gateway:
             log=None if history is None else HistorySource(kept.directory, config.site),
             clients=modbus.clients,
         )
-        self.keepers = () if history is None else (HistoryKeeper(kept, self.site, clock, history),)
+        harvesting = () if history is None else (HistoryKeeper(kept, self.site, clock, history),)
+        self.keepers: tuple[Runnable, ...] = (watching, *harvesting)
         self.listeners: tuple[Listener, ...] = (*modbus.listeners, *snmp.listeners, *http.listeners)
         self.supervisor = Supervisor(clock, self.lines, self.listeners, self.keepers)
 

@@ -8,10 +8,9 @@ import logging
 import pytest
 
 from gateway.core.identity import Identity
-from gateway.core.polling import IDENTITY_MISMATCH, NOT_REWRITTEN
 from gateway.core.settings import PollSettings
 from gateway.core.site import Outcome
-from gateway.core.snapshot import DeviceState
+from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN, DeviceState
 from gateway.devices.schema import load_map
 from gateway.errors import EchoUnknown, IdentityUnproven, IllegalFunction, ReplyTimeout
 from gateway.modbus.pdu import Function, ReadRequest

@@ -117,6 +117,7 @@ symbol = "faults"
 group = "live"
 codec = "bits"
 bits = "faults"
+conditions = { first = 100, name = "fault" }
 help = "Faults."
 doc = "RAM"
 mib = { column = 4, syntax = "Bits" }

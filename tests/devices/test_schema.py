@@ -49,6 +49,11 @@ def test_an_unknown_model_is_named_with_the_known_ones() -> None:
         load_map("tristar")
 
 
+def _load(point: str, disconnected: str, connected: str) -> tuple[str, str]:
+    table = f'[load]\npoint = "{point}"\ndisconnected = {disconnected}\nconnected = {connected}\n\n[enumeration]'
+    return "[enumeration]", table
+
+
 @pytest.mark.parametrize(
     ("old", "new", "entry"),
     [
@@ -193,6 +198,23 @@ def test_wrong_form_names_the_entry(changed: Change, old: str, new: str, entry: 
             [('group = "live"\ncodec = "bits"', 'group = "live"\naccess = "set"\ncodec = "bits"')],
             "point faults: set only",
         ),
+        ([('conditions = { first = 100, name = "fault" }\n', "")], "point faults: conditions: live bits need them"),
+        ([("first = 100, name", "first = 150, name")], "point faults: conditions: first 150; allowed: 100, 200, 300"),
+        (
+            [('enumeration = "state"', 'enumeration = "state"\nconditions = { first = 200, name = "state" }')],
+            "point charge_state: conditions: are for live bits",
+        ),
+        (
+            [('enumeration = "state"', 'enumeration = "state"\nconditions = { first = 100, name = "fault" }')],
+            "point faults: conditions: first 100 belongs to charge_state",
+        ),
+        (
+            [('enumeration = "state"', 'enumeration = "state"\nconditions = { first = 200, name = "fault" }')],
+            "point faults: conditions: name fault belongs to charge_state",
+        ),
+        ([_load("limit", "[0]", "[1]")], "load: no polled enumeration limit"),
+        ([_load("charge_state", "[7]", "[1]")], "load: 7 is no value of charge_state"),
+        ([_load("charge_state", "[0, 1]", "[1]")], "load: 1 is both connected and disconnected"),
     ],
 )
 def test_nonsense_names_the_entry(changed: Change, pieces: list[tuple[str, str]], problem: str) -> None:

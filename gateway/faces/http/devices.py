@@ -17,9 +17,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from gateway.core.polling import IDENTITY_MISMATCH, NOT_REWRITTEN
 from gateway.core.site import Device, Site
-from gateway.core.snapshot import DeviceState, Snapshot
+from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN, DeviceState, Snapshot
 from gateway.devices.model import DeviceMap, Point, Value
 from gateway.errors import MapError
 from gateway.faces.http.metric import Labels, MetricInfo, MetricKind, gauge

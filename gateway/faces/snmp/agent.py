@@ -15,6 +15,7 @@ from collections.abc import Mapping
 
 import gateway
 from gateway.clock import Clock
+from gateway.core.conditions import Conditions
 from gateway.core.site import Site
 from gateway.core.stats import ModbusServerStats
 from gateway.errors import ListenError
@@ -42,7 +43,16 @@ class SnmpAgent:
     `counters` tells what was asked, `layout` what there is. sysUpTime counts from the construction.
     """
 
-    def __init__(self, settings: SnmpSettings, site: Site, clock: Clock, modbus: ModbusServerStats) -> None:
+    def __init__(
+        self,
+        settings: SnmpSettings,
+        site: Site,
+        clock: Clock,
+        modbus: ModbusServerStats,
+        *,
+        conditions: Conditions | None = None,
+    ) -> None:
+        """Without `conditions` of somebody who tells them of the gateway, those of lines and devices are shown."""
         self.counters = SnmpCounters()
         self.layout: Layout = shipped_layout(settings.enterprise_root)
         self._settings = settings
@@ -61,6 +71,7 @@ class SnmpAgent:
                 (standard.SNMP_MIB, "SNMPv2-MIB: the system and snmp groups, read-only"),
                 (self.layout.module, "PROSTAR-GATEWAY-MIB: gateway, lines and solar charge controllers"),
             ),
+            conditions=conditions if conditions is not None else Conditions(site, (), clock.monotonic()),
         )
         self.tree: Tree = whole(self.layout, described, standard.GROUPS, (standard.CAPABILITIES,))
         contexts: Mapping[bytes, Tree] = {b"": self.tree}

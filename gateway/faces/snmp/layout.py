@@ -3,13 +3,12 @@
 ```
 root                     PROSTAR-GATEWAY-REG-MIB, the one configurable OID
  ├ 1 modules             1 PROSTAR-GATEWAY-TC-MIB   2 PROSTAR-GATEWAY-MIB
- │      2.1 objects      1 gateway 2 line 3 device 4 live 5 energy 6 today 7 settings 9 Modbus server
+ │      2.1 objects      1 gateway 2 line 3 device 4 live 5 energy 6 today 7 settings 8 condition 9 Modbus server
  │      2.2 conformance  1 groups 2 compliances
  └ 2 products            1 this gateway (sysObjectID)
 ```
 
-The agent and the MIB generator both read it (docs/adr/0001), so it imports no SNMP library. Object 8 is for the
-condition table and everything past 9 for tables that grow with the log; notifications will hang at `2.0`.
+The agent and the MIB generator both read it (docs/adr/0001), so it imports no SNMP library.
 
 A point of a map becomes a column of its group's table by the number in the map. Points of one name share a column
 over all models; a disagreement about number, syntax, scale, units or labels is a `MapError`.
@@ -25,7 +24,7 @@ from dataclasses import dataclass, replace
 from gateway.devices.model import Bit, DeviceMap, EnumValue, Group, Point
 from gateway.devices.schema import load_map, models
 from gateway.errors import MapError
-from gateway.faces.snmp import tables
+from gateway.faces.snmp import condition_tables, tables
 from gateway.faces.snmp.objects import (
     CellValue,
     Changes,
@@ -107,7 +106,9 @@ def layout(maps: Iterable[DeviceMap], root: Oid = DEFAULT_ROOT) -> Layout:
     """Describe the MIB of all `maps` under `root`; MapError when two maps disagree about a column."""
     objects: Oid = (*root, 1, 2, 1)
     groups = (
-        ScalarGroup((*objects, 1), 1, "pgwGateway", "The gateway itself.", tables.GATEWAY),
+        ScalarGroup(
+            (*objects, 1), 1, "pgwGateway", "The gateway itself.", (*tables.GATEWAY, *condition_tables.GATEWAY)
+        ),
         ScalarGroup((*objects, 9), 9, "pgwModbus", "The Modbus TCP server since the start.", tables.MODBUS),
     )
     by_model = sorted(maps, key=lambda device_map: device_map.model)
@@ -129,7 +130,17 @@ def layout(maps: Iterable[DeviceMap], root: Oid = DEFAULT_ROOT) -> Layout:
             "The devices of the gateway, by unit id. Every row always answers, whatever the device does.",
             RowKind.DEVICE,
             "pgwDeviceUnitId",
-            tables.DEVICE,
+            (*tables.DEVICE, *condition_tables.DEVICE),
+        ),
+        Table(
+            (*objects, 8),
+            8,
+            "pgwCondition",
+            "Everything that can be wrong with a device, a line or the gateway. Every row is always there.",
+            RowKind.CONDITION,
+            "pgwConditionUnitId",
+            condition_tables.CONDITION,
+            indexes=condition_tables.INDEXES,
         ),
     )
     of_points = tuple(
@@ -145,12 +156,9 @@ def layout(maps: Iterable[DeviceMap], root: Oid = DEFAULT_ROOT) -> Layout:
         )
         for number, name, group, description in _POINT_TABLES
     )
-    in_use = {
-        column.convention.name: column.convention
-        for table in (*fixed, *of_points)
-        for column in table.columns
-        if column.convention is not None
-    }
+    described = [each for group in groups for each in group.objects]
+    described += [column for table in (*fixed, *of_points) for column in table.columns]
+    in_use = {each.convention.name: each.convention for each in described if each.convention is not None}
     conventions = tuple(in_use[name] for name in sorted(in_use))
     return Layout(root, groups, tuple(table for table in (*fixed, *of_points) if table.columns), conventions)
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from enum import Enum, StrEnum
 from typing import Any
 
+from gateway.core.conditions import Conditions, DeviceConditions, Watch
 from gateway.core.site import Device, LinePort, Site
 from gateway.core.stats import ModbusServerStats
 from gateway.faces.snmp.counters import SnmpCounters
@@ -70,6 +71,7 @@ class Gateway:
     location: str
     object_id: Oid  # sysObjectID
     capabilities: tuple[tuple[Oid, str], ...]  # rows of sysORTable
+    conditions: Conditions | None = None  # None: nobody watches them
 
     def ticks(self, at: float) -> int:
         """Moment `at` as sysUpTime, hundredths of a second; 0 for moments before the start."""
@@ -93,6 +95,15 @@ class DeviceRow:
 
 
 @dataclass(frozen=True, slots=True)
+class ConditionRow:
+    """A row of the condition table; `of` are the conditions of its device, None for those of the gateway."""
+
+    gateway: Gateway
+    watch: Watch
+    of: DeviceConditions | None
+
+
+@dataclass(frozen=True, slots=True)
 class CapabilityRow:
     """A row of sysORTable."""
 
@@ -100,7 +111,7 @@ class CapabilityRow:
     position: int  # 0-based
 
 
-Row = Gateway | LineRow | DeviceRow | CapabilityRow
+Row = Gateway | LineRow | DeviceRow | ConditionRow | CapabilityRow
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,12 +160,24 @@ class RowKind(Enum):
 
     LINE = "line"
     DEVICE = "device"
+    CONDITION = "condition"
     CAPABILITY = "capability"
 
 
 @dataclass(frozen=True, slots=True)
+class Index:
+    """An index object of a table: an Unsigned32 that is not accessible."""
+
+    number: int  # its column
+    name: str
+    least: int
+    most: int
+    description: str
+
+
+@dataclass(frozen=True, slots=True)
 class Table:
-    """Cells `base.1.<column>.<index>`; the index is one integer and column 1, which is not accessible."""
+    """Cells `base.1.<column>.<index>`; the index is one integer and column 1, unless `indexes` says more."""
 
     base: Oid
     number: int  # last arc of base
@@ -164,6 +187,7 @@ class Table:
     index: str  # name of the index object
     columns: tuple[ObjectType, ...]
     index_of: str | None = None  # the table that owns the index, when this one borrows it
+    indexes: tuple[Index, ...] = ()  # its own index objects, behind the one that it borrows
 
 
 def text(value: str) -> bytes:

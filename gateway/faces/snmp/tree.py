@@ -22,6 +22,7 @@ from gateway.faces.snmp.objects import (
     CapabilityRow,
     CellValue,
     Changes,
+    ConditionRow,
     DeviceRow,
     Gateway,
     LineRow,
@@ -211,6 +212,14 @@ def _rows(table: Table, gateway: Gateway) -> list[tuple[Oid, Row]]:
         return [((line.index,), LineRow(gateway, line)) for line in gateway.site.lines]
     if table.rows is RowKind.DEVICE:
         return [((device.unit_id,), DeviceRow(gateway, device)) for device in gateway.site.devices]
+    if table.rows is RowKind.CONDITION:
+        conditions = gateway.conditions
+        if conditions is None:
+            return []
+        return [
+            ((watch.unit_id, watch.condition.code), ConditionRow(gateway, watch, conditions.devices.get(watch.unit_id)))
+            for watch in conditions
+        ]
     return [((at + 1,), CapabilityRow(gateway, at)) for at in range(len(gateway.capabilities))]
 
 

@@ -11,7 +11,7 @@ from gateway.core.site import Device, Site
 from gateway.core.snapshot import DeviceState, Snapshot
 from gateway.core.stats import ModbusServerStats
 from gateway.devices.model import DeviceMap
-from gateway.faces.snmp import tables
+from gateway.faces.snmp import condition_tables, tables
 from gateway.faces.snmp.agent import SnmpAgent
 from gateway.faces.snmp.objects import Syntax
 from gateway.faces.snmp.settings import Oid, SnmpSettings
@@ -120,7 +120,7 @@ def test_a_step_over_a_site_of_silent_devices_is_short(
     steps = [tree.after(LIVE, clock.now) for _ in range(100)]
     assert time.perf_counter() - before < 0.1
     assert steps[0] is not None
-    assert steps[0][0][:-2] == (*LIVE[:-2], 9)
+    assert steps[0][0][:-4] == (*LIVE[:-2], 8)  # the condition table, which is behind the values
 
 
 @pytest.mark.parametrize("state", list(DeviceState))
@@ -130,7 +130,8 @@ def test_the_device_row_answers_in_every_state(
     device = site.by_unit[21]
     device.snapshot = replace(device.snapshot, state=state)
     row = [oid for oid in walk(agent, clock.now) if oid[:-2] == (*LIVE[:-2], 3, 1) and oid[-1] == 21]
-    assert [oid[-2] for oid in row] == [column.number for column in tables.DEVICE]
+    columns = (*tables.DEVICE, *condition_tables.DEVICE)
+    assert [oid[-2] for oid in row] == [column.number for column in columns]
 
 
 def test_ages_and_uptime_come_from_the_monotonic_clock(agent: SnmpAgent, clock: StubClock) -> None:

@@ -63,9 +63,11 @@ async def test_every_answered_oid_is_in_the_mib_with_its_type(ask: Ask, agent: S
     assert code == 0
     answered = cells(output)
     expected = {}
+    at = len(agent.layout.objects)
+    in_tables = {table.number for table in agent.layout.tables}
     for slot in agent.tree:
         if slot.oid[:7] == agent.layout.root[:7] and slot.varbind(clock.now) is not None:
-            index = slot.oid[-1]
+            index = ".".join(map(str, slot.oid[at + (3 if slot.oid[at] in in_tables else 2) :]))
             expected[f"{slot.object.name}.{index}"] = NET_SNMP_TYPES[slot.object.syntax]
     assert set(answered) == set(expected)
     for name, shown in answered.items():
@@ -84,7 +86,7 @@ async def test_every_leaf_of_the_mib_is_answered(
     _, output = await ask("snmpwalk", ROOT)
     answered = cells(output)
     assert len(leaves) > 150
-    assert {name.rpartition(".")[0] for name in answered} == leaves
+    assert {name.partition(".")[0] for name in answered} == leaves
 
 
 @pytest.mark.parametrize("table", ["pgwLine", "pgwDevice", "pgwLive", "pgwEnergy", "pgwToday", "pgwSettings"])
@@ -96,6 +98,27 @@ async def test_snmptable_shows_every_table(ask: Ask, agent: SnmpAgent, table: st
     assert rows[0] == ["index", *(column.name for column in described.columns)]
     indexes = {"pgwLine": ["1", "2"], "pgwDevice": ["11", "12", "21"]}.get(table, ["11", "21"])
     assert [row[0] for row in rows[1:]] == indexes
+
+
+async def test_every_condition_has_a_row_whatever_the_device_does(ask: Ask, site: Site) -> None:
+    device = site.by_unit[11]
+    device.snapshot = replace(device.snapshot, values={**device.snapshot.values, "array_faults": 1 << 3, "alarms": 0})
+    _, output = await ask("snmpwalk", "PROSTAR-GATEWAY-MIB::pgwConditionTable")
+    rows = cells(output)
+    assert {name.split(".")[1] for name in rows} == {"0", "11", "12", "21"}
+    assert len([name for name in rows if name.startswith("pgwConditionState.12.")]) > 45
+    assert rows["pgwConditionName.11.103"] == "STRING: array_fault_battery_hvd"
+    assert rows["pgwConditionText.11.103"] == "STRING: battery high-voltage disconnect"
+    assert rows["pgwConditionSeverity.11.103"] == "INTEGER: critical(3)"
+    assert rows["pgwConditionState.11.103"] == "INTEGER: raised(2)"
+    assert rows["pgwConditionCount.11.103"] == "Counter32: 1"
+    assert rows["pgwConditionState.11.328"] == "INTEGER: clear(1)"
+    assert rows["pgwConditionState.12.103"] == "INTEGER: unknown(3)"
+    assert rows["pgwConditionName.0.1002"] == "STRING: line_down"
+    _, output = await ask(
+        "snmpget", *(f"PROSTAR-GATEWAY-MIB::pgwDevice{each}.11" for each in ("Conditions", "Severity"))
+    )
+    assert [line.split(": ")[-1] for line in output.splitlines()][1] == "critical(3)"
 
 
 async def test_walks_by_getnext_and_by_getbulk_agree(ask: Ask) -> None:
