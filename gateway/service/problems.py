@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import get_args
@@ -30,6 +31,7 @@ _WRONG_TYPE = {
     "model_type": "is not a table",
     "finite_number": "is not a finite number",
 }
+_NAMES_A_FILE = re.compile(r"_file$|^tls_")
 _OUT_OF_RANGE = ("greater_than_equal", "less_than_equal", "greater_than", "less_than")
 
 
@@ -59,6 +61,12 @@ def show(value: object) -> str:
     except (TypeError, ValueError):  # TOML has dates, JSON has not
         text = str(value)
     return text if len(text) <= 60 else f"{text[:57]}…"
+
+
+def show_file(value: object) -> str:
+    """The value of a key that names a file: what does not look like a path may be the secret itself."""
+    looks_like_a_path = isinstance(value, str) and value.startswith("/") and value.isprintable()
+    return show(value) if looks_like_a_path else "the value"
 
 
 def table_at(path: Path) -> type[BaseModel] | None:
@@ -107,7 +115,8 @@ def _text(error: ErrorDetails) -> str:
     allowed = f"; allowed: {key.allowed}" if key else ""
     if kind == "missing":
         return f"is missing{allowed}"
-    shown = "the value" if key and key.secret else show(value)
+    name = next((part for part in reversed(path) if isinstance(part, str)), "")
+    shown = "the value" if key and key.secret else show_file(value) if _NAMES_A_FILE.search(name) else show(value)
     if kind == "too_short":
         return f"is empty{allowed}"
     if kind in _OUT_OF_RANGE:

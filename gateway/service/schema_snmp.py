@@ -39,7 +39,7 @@ def _oid(text: str) -> str:
 
 
 Oids = Annotated[tuple[Annotated[str, AfterValidator(_oid)], ...], Field(strict=False)]
-Credential = Annotated[str, Field(pattern=r"^(/[^\x00-\x1f]+|[A-Za-z0-9_][A-Za-z0-9_.-]{0,254})$")]
+Credential = Annotated[str, Field(pattern=r"^(/[^\x00-\x1f]+|[A-Za-z0-9_][A-Za-z0-9_.-]{0,254})$", repr=False)]
 ViewName = Annotated[str, Field(pattern=r"^[!-~]{0,32}$")]
 
 

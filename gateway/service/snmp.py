@@ -86,8 +86,7 @@ def unreadable(config: Config) -> Iterator[str]:
             try:
                 read_pass_phrase(getattr(user, key))
             except OSError as error:
-                reason = error.strerror or str(error)
-                yield f"snmp.user[{index}].{key}: {getattr(user, key)} cannot be read: {reason}"
+                yield f"snmp.user[{index}].{key}: {_unreadable(getattr(user, key), error)}"
 
 
 def snmp_advice(config: Config) -> Iterator[str]:
@@ -100,7 +99,7 @@ def snmp_advice(config: Config) -> Iterator[str]:
                 yield f"snmp.user[{index}].source[{number}]: {network} is everybody"
         for key in _PASSWORDS:
             path = pass_phrase_path(getattr(user, key))
-            if path.is_file() and path.stat().st_mode & 0o007:
+            if path.is_file() and path.stat().st_mode & 0o007:  # it is there: its name is no secret
                 mode = f"{path.stat().st_mode & 0o777:03o}"
                 yield f"snmp.user[{index}].{key}: {path} is open to every user of this machine (mode {mode})"
 
@@ -138,19 +137,22 @@ def _pass_phrases(path: Path, table: Raw) -> Iterator[Problem]:
 
 
 def _credentials(index: int, user: UserTable) -> Credentials:
-    try:
-        return Credentials(
-            user.name.encode(),
-            _AUTH[user.auth],
-            read_pass_phrase(user.auth_password_file),
-            _PRIV[user.priv],
-            read_pass_phrase(user.priv_password_file),
-        )
-    except OSError as error:
-        reason = f"{error.filename} cannot be read: {error.strerror or error}"
-        raise ConfigError((f"snmp.user[{index}]: {reason}",)) from None
-    except ValueError as error:
-        raise ConfigError((f"snmp.user[{index}]: {error}",)) from None
+    secrets: list[Secret] = []
+    for key in _PASSWORDS:
+        text = getattr(user, key)
+        try:
+            secrets.append(read_pass_phrase(text))
+        except OSError as error:
+            raise ConfigError((f"snmp.user[{index}].{key}: {_unreadable(text, error)}",)) from None
+        except ValueError as error:
+            raise ConfigError((f"snmp.user[{index}].{key}: {error}",)) from None
+    auth, priv = secrets
+    return Credentials(user.name.encode(), _AUTH[user.auth], auth, _PRIV[user.priv], priv)
+
+
+def _unreadable(text: str, error: OSError) -> str:
+    what = text if text.startswith("/") else "the systemd credential of this name"
+    return f"{what} cannot be read: {error.strerror or error}"
 
 
 def _networks(texts: Sequence[str]) -> tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]:

@@ -227,7 +227,7 @@ listen = ["127.0.0.1:70000"]
         ),
         (
             MINIMAL + '[http]\nbearer_token_file = "token"\n',
-            'http.bearer_token_file: "token" is not allowed; allowed: the absolute path of a file, or "" for none',
+            'http.bearer_token_file: the value is not allowed; allowed: the absolute path of a file, or "" for none',
         ),
         (
             MINIMAL + WRITE + 'point = ["battery_voltage"]\n',

@@ -75,7 +75,7 @@ def test_with_it_port_802_is_the_default_and_a_role_is_required(pki: Pki) -> Non
         ("[modbus.tls]\n", "modbus.tls.key_file: is missing; allowed: the absolute path of a PEM file"),
         (
             TLS.replace("{0}/ca.pem", "ca.pem"),
-            'modbus.tls.client_ca_file: "ca.pem" is not allowed; allowed: the absolute',
+            "modbus.tls.client_ca_file: the value is not allowed; allowed: the absolute",
         ),
         (TLS + "key = 'x'\n", "modbus.tls.key: unknown key; "),
         (TLS + '[modbus]\nlisten = ["127.0.0.1:802"]\n', '"127.0.0.1:802" clashes with modbus.'),
