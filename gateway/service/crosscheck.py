@@ -119,7 +119,7 @@ def _identity(path: Path, device: Raw, model: str) -> Iterator[Problem]:
 
 
 def _line_listeners(raw: Raw, lines: list[object]) -> list[Problem]:
-    """A listener stands for a line that there is, and a line has one listener."""
+    """A listener stands for a line that there is, a line has one listener, and TLS needs files."""
     listeners = list(_tables(_table(raw, "modbus"), "listener", ("modbus",)))
     problems = list(_repeated(((*path, "line"), listener.get("line")) for path, listener in listeners))
     for path, listener in listeners:
@@ -127,6 +127,9 @@ def _line_listeners(raw: Raw, lines: list[object]) -> list[Problem]:
         if isinstance(line, str) and line not in lines:
             known = ", ".join(show(name) for name in lines if isinstance(name, str))
             problems.append(Problem((*path, "line"), f"no line is called {show(line)}; allowed: {known}"))
+        if listener.get("tls") is True and not isinstance(_table(raw, "modbus").get("tls"), Mapping):
+            text = "there is no [modbus.tls] with the files for it; allowed: that table, or false"
+            problems.append(Problem((*path, "tls"), text))
     return problems
 
 

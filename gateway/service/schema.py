@@ -224,6 +224,9 @@ class ListenerTable(Table):
         ),
     ] = Field(min_length=1)
     line: Annotated[Name, Key("the name of a line", "The line that it stands for; each line has one listener at most.")]
+    tls: Annotated[
+        bool, Key("true or false", "Only through TLS, with the files and roles of [modbus.tls], which must be there.")
+    ] = False
 
 
 class WriteTable(Table):

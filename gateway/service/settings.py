@@ -84,7 +84,7 @@ def modbus_settings(config: Config) -> ModbusSettings:
     deadline_s = max(budget.reply_deadline_s for budget in line_budgets(config))
     return ModbusSettings(
         listen=_pairs(modbus.listen),
-        lines=tuple(LineListen(_pairs(listener.listen), listener.line) for listener in modbus.listener),
+        lines=tuple(LineListen(_pairs(listener.listen), listener.line, listener.tls) for listener in modbus.listener),
         max_connections=modbus.max_connections,
         max_per_client=modbus.max_per_client,
         priority=_networks(modbus.priority),

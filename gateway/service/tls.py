@@ -22,7 +22,7 @@ SOON_S = timedelta(days=30).total_seconds()
 def tls_settings(config: Config) -> TlsSettings | None:
     """The settings of the TLS listeners; None where there is none."""
     tls = config.modbus.tls
-    if tls is None or not tls.listen:
+    if tls is None or not (tls.listen or any(listener.tls for listener in config.modbus.listener)):
         return None
     return TlsSettings(
         listen=tuple((address.host, address.port) for address in map(parse_listen, tls.listen)),

@@ -449,6 +449,10 @@ def test_a_listener_stands_for_one_line() -> None:
             'modbus.listener[0].listen[0]: "127.0.0.1:1502" clashes with modbus.listen[0]',
         ),
         (LISTENER.format("shelter-a").replace('"127.0.0.1:1503"', ""), "modbus.listener[0].listen: is empty; allowed:"),
+        (
+            LISTENER.format("shelter-a") + "tls = true\n",
+            "modbus.listener[0].tls: there is no [modbus.tls] with the files for it; allowed: that table, or false",
+        ),
     ],
 )
 def test_a_listener_that_cannot_be(text: str, problem: str) -> None:

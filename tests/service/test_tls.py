@@ -11,6 +11,7 @@ import pytest
 
 from gateway.core.write_rules import Requester
 from gateway.errors import ConfigError
+from gateway.faces.modbus.settings import LineListen
 from gateway.service.advice import advice
 from gateway.service.config import Config, parse_config
 from gateway.service.settings import line_budgets, modbus_settings
@@ -66,6 +67,15 @@ def test_with_it_port_802_is_the_default_and_a_role_is_required(pki: Pki) -> Non
     assert settings.require_role
     assert settings.files.crl is None
     assert modbus_settings(config(pki)).tls == settings
+
+
+def test_the_only_way_in_by_tls_may_be_the_port_of_a_line(pki: Pki) -> None:
+    more = 'listen = []\n[[modbus.listener]]\nline = "shelter-a"\nlisten = ["127.0.0.1:1503"]\ntls = true\n'
+    settings = modbus_settings(config(pki, more))
+    assert settings.lines == (LineListen((("127.0.0.1", 1503),), "shelter-a", tls=True),)
+    assert settings.tls is not None
+    assert settings.tls.listen == ()
+    assert modbus_settings(config(pki, "listen = []\n")).tls is None
 
 
 @pytest.mark.parametrize(

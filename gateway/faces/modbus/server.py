@@ -139,17 +139,22 @@ class ModbusServer:
         self.writer = None if settings.writes is None else Writer(settings.writes, site, clock, stats, audit)
         shared = Shared(stats, audit, limiter, self.writer)
         self.dispatcher = Dispatcher(routes.by_unit(), clock, shared)
-        listeners = [Listener(self, self.dispatcher, host, port) for host, port in settings.listen]
-        for group in settings.lines:
-            dispatcher = Dispatcher(routes.of_line(group.line), clock, shared)
-            listeners += [Listener(self, dispatcher, host, port, line=group.line) for host, port in group.listen]
         self.door: TlsDoor | None = None
         if settings.tls is not None:
             stats.tls = TlsStats()
             barred = Dispatcher({}, clock, shared, barred=True)
-            door = TlsDoor(settings.tls, barred, clock, stats.tls, frame_timeout_s=settings.frame_timeout_s)
-            listeners += [Listener(self, self.dispatcher, host, port, door=door) for host, port in settings.tls.listen]
-            self.door = door
+            self.door = TlsDoor(settings.tls, barred, clock, stats.tls, frame_timeout_s=settings.frame_timeout_s)
+        listeners = [Listener(self, self.dispatcher, host, port) for host, port in settings.listen]
+        for group in settings.lines:
+            dispatcher = Dispatcher(routes.of_line(group.line), clock, shared)
+            door = self.door if group.tls else None
+            if group.tls and door is None:
+                raise ValueError("a listener with TLS needs the settings of TLS")  # never open to all instead
+            listeners += [
+                Listener(self, dispatcher, host, port, line=group.line, door=door) for host, port in group.listen
+            ]
+        for host, port in () if settings.tls is None else settings.tls.listen:
+            listeners.append(Listener(self, self.dispatcher, host, port, door=self.door))
         self.listeners: Sequence[Listener] = tuple(listeners)
         self.stats = stats
         self._now = clock.monotonic

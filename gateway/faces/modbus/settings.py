@@ -40,6 +40,7 @@ class LineListen:
 
     listen: tuple[tuple[str, int], ...]
     line: str
+    tls: bool = False  # only through TLS; needs `ModbusSettings.tls`
 
 
 @dataclass(frozen=True, slots=True)

@@ -303,12 +303,15 @@ class Running:
 
     @property
     def address(self) -> tuple[str, int]:
-        bound = self.server.listeners[0].bound
+        return self.bound(0)
+
+    def bound(self, listener: int) -> tuple[str, int]:
+        bound = self.server.listeners[listener].bound
         assert bound is not None
         return bound
 
-    async def connect(self, **options: object) -> Client:
-        reader, writer = await asyncio.open_connection(*self.address, **options)  # type: ignore[arg-type]
+    async def connect(self, listener: int = 0, **options: object) -> Client:
+        reader, writer = await asyncio.open_connection(*self.bound(listener), **options)  # type: ignore[arg-type]
         client = Client(reader, writer)
         self.clients.append(client)
         return client

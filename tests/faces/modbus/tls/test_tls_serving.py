@@ -10,6 +10,7 @@ from collections.abc import Callable
 import pytest
 from pymodbus.client import AsyncModbusTlsClient
 
+from gateway.faces.modbus.settings import LineListen
 from gateway.faces.modbus.tls_files import CIPHERS
 from gateway.modbus import mbap
 from tests.faces.modbus.conftest import Serve, read, register, registers
@@ -155,3 +156,27 @@ async def test_plain_and_tls_side_by_side_share_what_is_remembered(serve: Serve,
     pdu, reply = read(12, 0, 5)
     assert await one.query(12, pdu) == await other.query(12, pdu) == reply
     assert reply[2:] == registers(2, 0, 5)
+
+
+async def test_a_port_that_stands_for_a_line_may_be_behind_tls(serve_tls: ServeTls) -> None:
+    lines = (LineListen((("127.0.0.1", 0),), "shelter-b", tls=True),)
+    site = await serve_tls(lines=lines)
+    assert [listener.label for listener in site.running.server.listeners] == [
+        "modbus tls 127.0.0.1:0 line shelter-b",
+        "modbus tls 127.0.0.1:0",
+    ]
+    pdu, reply = read(21, 3, 4)
+    by_address, by_unit = await site.connect("reader"), await site.connect("reader", listener=1)
+    assert await by_address.query(1, pdu) == reply
+    assert await by_address.query(21, pdu) == b"\x83\x0a", "a unit id is no address"
+    assert await by_unit.query(21, pdu) == reply
+    assert await (await site.connect("norole")).query(1, pdu) == b"\x83\x01"
+    plain = await site.running.connect()
+    plain.ask(1, 1, pdu)
+    await plain.rest()
+    assert site.stats.refused == {"not_tls": 1}
+
+
+async def test_a_line_behind_tls_is_never_open_without_it(serve: Serve) -> None:
+    with pytest.raises(ValueError, match="needs the settings of TLS"):
+        await serve(lines=(LineListen((("127.0.0.1", 0),), "shelter-a", tls=True),))
