@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from types import MappingProxyType
 
-from gateway.devices.model import Identification, Space, Value
+from gateway.devices.model import Identification, Point, Space, Value
 
 IDENTITY_MISMATCH = "identity_mismatch"
 NOT_REWRITTEN = "slave_control_not_refreshed"
@@ -65,6 +65,14 @@ class Snapshot:
     def shown(self) -> Mapping[str, Value]:
         """Values that a face may show now: all of an online device, none of any other."""
         return self.values if self.state is DeviceState.ONLINE else _NO_VALUES
+
+    def block_of(self, point: Point) -> Block | None:
+        """The block that the whole point was last read in, with a value or without; None when it was not read."""
+        end = point.address + point.words
+        for block in self.blocks:
+            if block.space is point.space and block.first <= point.address and end <= block.first + block.count:
+                return block
+        return None
 
     def age_s(self, point: str, now: float) -> float | None:
         """Age of a point's value in seconds, or None when it was never read."""

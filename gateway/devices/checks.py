@@ -12,7 +12,7 @@ from itertools import pairwise
 
 from gateway.devices.codecs import CODECS
 from gateway.devices.log import HOURMETER
-from gateway.devices.model import Access, DeviceMap, Extent, Group, LogLayout, Point, PollClass, Space
+from gateway.devices.model import Access, DeviceMap, Emc1Form, Extent, Group, LogLayout, Point, PollClass, Space
 from gateway.devices.units import UNITS, metric_name
 
 _STATE_CODECS = frozenset({"enum", "flag", "coil"})
@@ -222,6 +222,22 @@ def _mib(device_map: DeviceMap) -> Iterator[str]:
             yield f"{prefix}scale {point.mib.scale} {point.mib.units!r} for unit {point.unit!r}; allowed: {allowed}"
 
 
+def _emc1(device_map: DeviceMap) -> Iterator[str]:
+    known = [(point, point.emc1) for point in device_map.points if point.emc1 is not None]
+    if known and device_map.emc1_root is None:
+        yield "emc1: points have a number and the table has no root"
+    yield from _doubles([str(found.number) for _, found in known], "emc1: number")
+    for point, found in known:
+        fits = {
+            Emc1Form.FLOAT: point.enumeration is None and point.bits is None,
+            Emc1Form.INTEGER: point.enumeration is not None or point.bits is not None,
+            Emc1Form.UNSIGNED: point.mib is not None and point.mib.syntax == "Unsigned32",
+            Emc1Form.BITS: point.bits is not None,
+        }
+        if not fits[found.form]:
+            yield f"point {point.name}: emc1: form {found.form} does not fit the point"
+
+
 def _metrics(device_map: DeviceMap) -> Iterator[str]:
     yield from _doubles([point.metric for point in device_map.points if point.metric is not None], "metric")
     for point in device_map.points:
@@ -286,6 +302,7 @@ _CHECKS: tuple[Callable[[DeviceMap], Iterator[str]], ...] = (
     _load,
     _number_tables,
     _mib,
+    _emc1,
     _metrics,
     _log,
 )

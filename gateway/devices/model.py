@@ -96,6 +96,23 @@ class MibColumn:
     syntax: str  # "Integer32", "Unsigned32", "Enumeration" or "Bits"
 
 
+class Emc1Form(StrEnum):
+    """How Morningstar's Ethernet converter writes a value."""
+
+    FLOAT = "float"  # a text: "53.9375", "nan"
+    INTEGER = "integer"  # the number of an enumeration or of switches
+    UNSIGNED = "unsigned"  # in the point's MIB scale: 0.1 Ah
+    BITS = "bits"  # four octets, bit 0 first
+
+
+@dataclass(frozen=True, slots=True)
+class Emc1Object:
+    """The point in the flat MIB of that converter; the numbers are the vendor's."""
+
+    number: int
+    form: Emc1Form
+
+
 @dataclass(frozen=True, slots=True)
 class BitConditions:
     """Each bit of a point is a condition: its number there is `first` + the bit's, its name begins with `name`."""
@@ -138,6 +155,8 @@ class Point:
     named_only: bool = False  # to be written only where its very name was allowed, never as one of a range
     wears: bool = False  # a write makes the device write its own EEPROM
     conditions: BitConditions | None = None  # what its bits are to core/conditions.py
+    setpoint: bool = False  # what the device aims at or acts upon, not what it measures
+    emc1: Emc1Object | None = None
 
     @property
     def polled(self) -> bool:
@@ -263,6 +282,7 @@ class DeviceMap:
     identity: IdentityRules
     night: NightRule | None = None
     load: LoadRule | None = None
+    emc1_root: tuple[int, ...] | None = None  # OID above the `emc1` objects; None: that converter does not know it
 
     def covers(self, space: Space, first: int, end: int) -> bool:
         """Whether every address from `first` to one before `end` lies in an extent."""

@@ -22,6 +22,8 @@ from gateway.devices.model import (
     Bit,
     BitConditions,
     DeviceMap,
+    Emc1Form,
+    Emc1Object,
     EnumValue,
     Extent,
     Group,
@@ -109,6 +111,14 @@ class _Conditions(_Form):
         return BitConditions(self.first, self.name)
 
 
+class _Emc1(_Form):
+    number: Annotated[int, Field(ge=1)]
+    form: Literal["float", "integer", "unsigned", "bits"]
+
+    def build(self) -> Emc1Object:
+        return Emc1Object(self.number, Emc1Form(self.form))
+
+
 class _Point(_Form):
     name: Label
     space: SpaceName = "registers"
@@ -138,7 +148,9 @@ class _Point(_Form):
     named_only: bool = False
     wears: bool = False
     conditions: _Conditions | None = None
+    setpoint: bool = False
     mib: _Mib | None = None
+    emc1: _Emc1 | None = None
     metric: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")] | None = None
     metric_scale: Number = 1
 
@@ -184,6 +196,8 @@ class _Point(_Form):
             named_only=self.named_only,
             wears=self.wears,
             conditions=None if self.conditions is None else self.conditions.build(),
+            setpoint=self.setpoint,
+            emc1=None if self.emc1 is None else self.emc1.build(),
         )
 
 
@@ -249,6 +263,13 @@ class _Load(_Form):
         return LoadRule(self.point, frozenset(self.disconnected), frozenset(self.connected))
 
 
+class _Emc1Root(_Form):
+    root: Annotated[str, Field(pattern=r"^1\.3\.6\.1\.4\.1(\.[1-9][0-9]{0,8})+$")]
+
+    def build(self) -> tuple[int, ...]:
+        return tuple(map(int, self.root.split(".")))
+
+
 class _Identity(_Form):
     vendor: Text
     product_prefixes: tuple[Text, ...] = Field(strict=False)
@@ -280,6 +301,7 @@ class _File(_Form):
     identity: _Identity
     night: _Night | None = None
     load: _Load | None = None
+    emc1: _Emc1Root | None = None
     extent: tuple[_Extent, ...] = Field(strict=False)
     reserved: tuple[_Extent, ...] = Field(default=(), strict=False)
     enumeration: dict[Label, Annotated[tuple[_EnumValue, ...], Field(strict=False)]] = {}
@@ -313,6 +335,7 @@ class _File(_Form):
             identity=self.identity.build(),
             night=NightRule(self.night.point, self.night.value) if self.night is not None else None,
             load=None if self.load is None else self.load.build(),
+            emc1_root=None if self.emc1 is None else self.emc1.build(),
         )
 
 

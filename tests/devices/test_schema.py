@@ -136,6 +136,27 @@ def test_wrong_form_names_the_entry(changed: Change, old: str, new: str, entry: 
         ([('name = "limit"', 'name = "faults"')], "point faults: stands 2 times"),
         ([("number = 1, name", "number = 0, name")], "enumeration state: number 0: stands 2 times"),
         ([('name = "open"', 'name = "short"')], "bits faults: name short: stands 2 times"),
+        (
+            [('mib = { column = 3, syntax = "Enumeration" }', 'emc1 = { number = 45, form = "integer" }')],
+            "emc1: points have a number and the table has no root",
+        ),
+        (
+            [
+                ("[identity]", '[emc1]\nroot = "1.3.6.1.4.1.33333.5"\n\n[identity]'),
+                ('mib = { column = 3, syntax = "Enumeration" }', 'emc1 = { number = 45, form = "float" }'),
+            ],
+            "point charge_state: emc1: form float does not fit the point",
+        ),
+        (
+            [
+                (
+                    'units = "millivolts", syntax = "Integer32" }',
+                    'units = "millivolts", syntax = "Integer32" }\nemc1 = { number = 45, form = "float" }',
+                ),
+                ('mib = { column = 3, syntax = "Enumeration" }', 'emc1 = { number = 45, form = "integer" }'),
+            ],
+            "emc1: number 45: stands 2 times",
+        ),
         ([("mib = { column = 4", "mib = { column = 3")], "point faults: mib: column 3 of table live belongs to"),
         ([('units = "millivolts"', 'units = "volts"')], "point battery_voltage: mib: scale 1000 'volts'"),
         ([("{ column = 2, scale = 1000", "{ column = 2, scale = 100")], "point battery_voltage: mib: scale 100"),

@@ -19,7 +19,7 @@ from gateway.core.conditions import Conditions
 from gateway.core.site import Site
 from gateway.core.stats import ModbusServerStats
 from gateway.errors import ListenError
-from gateway.faces.snmp import standard
+from gateway.faces.snmp import entity, standard
 from gateway.faces.snmp.counters import SnmpCounters
 from gateway.faces.snmp.engine import Engine, EngineLost, start_engine
 from gateway.faces.snmp.layout import Layout, shipped_layout
@@ -70,10 +70,12 @@ class SnmpAgent:
             capabilities=(
                 (standard.SNMP_MIB, "SNMPv2-MIB: the system and snmp groups, read-only"),
                 (self.layout.module, "PROSTAR-GATEWAY-MIB: gateway, lines and solar charge controllers"),
+                *entity.CAPABILITIES,
             ),
             conditions=conditions if conditions is not None else Conditions(site, (), clock.monotonic()),
         )
-        self.tree: Tree = whole(self.layout, described, standard.GROUPS, (standard.CAPABILITIES,))
+        groups = (*standard.GROUPS, entity.GENERAL)
+        self.tree: Tree = whole(self.layout, described, groups, (standard.CAPABILITIES, *entity.TABLES))
         contexts: Mapping[bytes, Tree] = {b"": self.tree}
         self._responder = Responder(settings, contexts, self.counters)
         self._throttle = Throttle()

@@ -19,6 +19,7 @@ from typing import Any
 from gateway.core.conditions import Conditions, DeviceConditions, Watch
 from gateway.core.site import Device, LinePort, Site
 from gateway.core.stats import ModbusServerStats
+from gateway.devices.model import Point
 from gateway.faces.snmp.counters import SnmpCounters
 from gateway.faces.snmp.settings import Oid
 
@@ -111,7 +112,18 @@ class CapabilityRow:
     position: int  # 0-based
 
 
-Row = Gateway | LineRow | DeviceRow | ConditionRow | CapabilityRow
+@dataclass(frozen=True, slots=True)
+class EntityRow:
+    """A row of entPhysicalTable: the gateway itself, a device of it, or what a device measures."""
+
+    gateway: Gateway
+    index: int
+    position: int  # among those with the same container, from 1
+    device: Device | None = None
+    point: Point | None = None  # with a device only
+
+
+Row = Gateway | LineRow | DeviceRow | ConditionRow | CapabilityRow | EntityRow
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +141,7 @@ class ObjectType:
     """A scalar or a column.
 
     `get(row, now)` gives the value; `row` is of the kind that the group or table says. `models` names the
-    models that have the column; None: every row has it.
+    models that have the column, `only` tells it of a row; None: every row has it.
     """
 
     number: int
@@ -142,6 +154,7 @@ class ObjectType:
     changes: Changes = Changes.ALWAYS
     models: frozenset[str] | None = None
     point: str | None = None  # the map's point; without a shown value of it there is no cell
+    only: Callable[[Any], bool] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,6 +175,8 @@ class RowKind(Enum):
     DEVICE = "device"
     CONDITION = "condition"
     CAPABILITY = "capability"
+    ENTITY = "entity"
+    SENSOR = "sensor"  # those entities that measure
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,10 +13,11 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from gateway.core.site import Device
 from gateway.faces.snmp import wire
+from gateway.faces.snmp.entity import entities
 from gateway.faces.snmp.layout import Layout
 from gateway.faces.snmp.objects import (
     CapabilityRow,
@@ -181,11 +182,12 @@ class Tree(Window):
             for described in group.objects
         ]
         for table in tables:
-            for index, row in _rows(table, gateway):
+            for index, row in _ROWS[table.rows](gateway):
                 slots += [
                     Slot((*table.base, 1, column.number, *index), column, row)
                     for column in table.columns
-                    if column.models is None or _model(row) in column.models
+                    if (column.models is None or _model(row) in column.models)
+                    and (column.only is None or column.only(row))
                 ]
         slots.sort(key=lambda slot: slot.oid)
         objects = frozenset((*group.base, each.number) for group in groups for each in group.objects) | frozenset(
@@ -206,21 +208,33 @@ def whole(layout: Layout, gateway: Gateway, groups: Sequence[ScalarGroup], table
     return Tree(gateway, (*groups, *layout.groups), (*tables, *layout.tables))
 
 
-def _rows(table: Table, gateway: Gateway) -> list[tuple[Oid, Row]]:
-    """The rows that the table will ever have, by the arcs of their index."""
-    if table.rows is RowKind.LINE:
-        return [((line.index,), LineRow(gateway, line)) for line in gateway.site.lines]
-    if table.rows is RowKind.DEVICE:
-        return [((device.unit_id,), DeviceRow(gateway, device)) for device in gateway.site.devices]
-    if table.rows is RowKind.CONDITION:
-        conditions = gateway.conditions
-        if conditions is None:
-            return []
-        return [
-            ((watch.unit_id, watch.condition.code), ConditionRow(gateway, watch, conditions.devices.get(watch.unit_id)))
-            for watch in conditions
-        ]
-    return [((at + 1,), CapabilityRow(gateway, at)) for at in range(len(gateway.capabilities))]
+Rows = list[tuple[Oid, Row]]
+"""Rows with the arcs of their index."""
+
+
+def _conditions(gateway: Gateway) -> Rows:
+    conditions = gateway.conditions
+    if conditions is None:
+        return []
+    return [
+        ((watch.unit_id, watch.condition.code), ConditionRow(gateway, watch, conditions.devices.get(watch.unit_id)))
+        for watch in conditions
+    ]
+
+
+_ROWS: Mapping[RowKind, Callable[[Gateway], Rows]] = {
+    RowKind.LINE: lambda gateway: [((line.index,), LineRow(gateway, line)) for line in gateway.site.lines],
+    RowKind.DEVICE: lambda gateway: [((each.unit_id,), DeviceRow(gateway, each)) for each in gateway.site.devices],
+    RowKind.CONDITION: _conditions,
+    RowKind.CAPABILITY: lambda gateway: [
+        ((at + 1,), CapabilityRow(gateway, at)) for at in range(len(gateway.capabilities))
+    ],
+    RowKind.ENTITY: lambda gateway: [((entity.index,), entity) for entity in entities(gateway)],
+    RowKind.SENSOR: lambda gateway: [
+        ((entity.index,), entity) for entity in entities(gateway) if entity.point is not None
+    ],
+}
+"""The rows that a table of this kind will ever have."""
 
 
 def _model(row: Row) -> str:
