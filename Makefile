@@ -76,6 +76,10 @@ PIP_COMPILE = $(BIN)/pip-compile --quiet --generate-hashes --strip-extras --allo
 	--no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-emit-options \
 	--build-deps-for editable --extra fast $(if $(UPGRADE),--upgrade)
 
+.PHONY: wheels
+wheels: $(VENV)/.runtime ## Fetch the locked libraries into dist/wheels, for a machine without a network.
+	$(call step,dist/wheels,$(PIP) download --require-hashes --only-binary :all: --requirement requirements.txt --dest dist/wheels)
+
 .PHONY: clean
 clean: ## Remove .venv and everything that was made by a tool.
 	@rm -rf $(VENV) build dist htmlcov .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache \

@@ -192,6 +192,12 @@ class ListenError(GatewayError):
     label = "listen"
 
 
+class BackupError(GatewayError):
+    """A backup cannot be made or restored; the message names the file and why. Nothing was changed."""
+
+    label = "backup"
+
+
 class CertificateRefused(GatewayError):
     """A client's certificate cannot be served; `reason` is the label under which it is counted."""
 

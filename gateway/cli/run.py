@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import resource
+import sys
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -12,6 +14,7 @@ from gateway.service.gateway import serve
 from gateway.service.logs import Level, set_up_logging
 from gateway.service.loops import Loop, loop_factory
 from gateway.service.snmp import unreadable
+from gateway.service.state_dir import claimed
 
 
 def command(
@@ -31,4 +34,8 @@ def command(
     checked = load_or_exit(config)
     if missing := [f"{config}: {text}" for text in unreadable(checked)]:
         refuse(config, missing)
-    serve(checked, make_loop)
+    with claimed(Path(checked.state_dir)) as mine:
+        if not mine:
+            print(f"{config}: another gateway uses the state_dir {checked.state_dir}", file=sys.stderr)
+            raise typer.Exit(1)
+        serve(checked, make_loop)

@@ -34,6 +34,9 @@ peers=(
   "nodejs node"
   "npm npm"
   "libsnmp-dev /usr/include/net-snmp/net-snmp-config.h"
+  "systemd systemd-analyze"
+  "udev udevadm"
+  "umockdev umockdev-run"
 )
 policy=/usr/sbin/policy-rc.d
 export PATH="$PATH:/usr/local/sbin:/usr/sbin:/sbin"
