@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import socket
 import struct
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from gateway.faces.modbus.accepting import ACCEPT_PAUSE_S, Acceptor, listening_socket
-from gateway.faces.modbus.sockets import READ_BYTES, TURN, Hub, SocketTransport
+from gateway.faces.modbus.sockets import FIRST_BYTES, READ_BYTES, TURN, Hub, SocketTransport
 
 
 class Recorder(asyncio.Protocol):
@@ -72,6 +73,10 @@ def opened() -> Iterator[list[socket.socket]]:
 @pytest.fixture
 async def pair(hub: Hub, opened: list[socket.socket]) -> Pair:
     """A protocol on one end of a TCP connection; the other end blocks for 10 s at most."""
+    return connected(hub, opened)
+
+
+def connected(hub: Hub, opened: list[socket.socket]) -> Pair:
     with socket.create_server(("127.0.0.1", 0)) as server:
         far = socket.create_connection(server.getsockname(), 10)
         near, peername = server.accept()
@@ -106,6 +111,73 @@ async def test_bytes_come_in_pieces_and_in_order(pair: Pair) -> None:
     transport.abort()
     await recorder.lost.wait()
     assert [told for told in recorder.told if told != "data"] == ["made", "lost"]
+
+
+@pytest.mark.parametrize("size", [1, FIRST_BYTES, FIRST_BYTES + 1, FIRST_BYTES + READ_BYTES, 3 * READ_BYTES])
+async def test_bytes_and_the_end_that_come_at_once_are_both_told(pair: Pair, size: int) -> None:
+    recorder, _, far = pair
+    far.sendall(bytes(size))
+    far.shutdown(socket.SHUT_WR)
+    await until(recorder.lost.is_set)
+    assert len(recorder.received) == size
+    assert [told for told in recorder.told if told != "data"] == ["made", "eof", "lost"]
+
+
+@pytest.mark.parametrize("size", [FIRST_BYTES, FIRST_BYTES + READ_BYTES, 7 * READ_BYTES])
+async def test_the_end_is_told_whenever_it_comes(pair: Pair, size: int) -> None:
+    recorder, _, far = pair
+    far.sendall(bytes(size))
+    await until(lambda: len(recorder.received) == size)
+    far.shutdown(socket.SHUT_WR)
+    await until(recorder.lost.is_set)
+
+
+async def test_what_came_while_nothing_was_read_is_read_afterwards(pair: Pair) -> None:
+    recorder, transport, far = pair
+    transport.pause_reading()
+    far.sendall(bytes(READ_BYTES))
+    far.shutdown(socket.SHUT_WR)
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert recorder.told == ["made"]
+    transport.resume_reading()
+    await until(recorder.lost.is_set)
+    assert len(recorder.received) == READ_BYTES
+
+
+async def test_bytes_that_come_while_replies_wait_are_all_read(pair: Pair) -> None:
+    recorder, transport, far = pair
+    transport.write(bytes(16_000_000))
+    for _ in range(20):
+        await asyncio.sleep(0)
+    far.setblocking(False)
+    with contextlib.suppress(BlockingIOError):
+        while far.recv(1_000_000):  # now the kernel takes more; both are told of in one turn
+            pass
+    far.sendall(bytes(3 * READ_BYTES))
+    await until(lambda: len(recorder.received) == 3 * READ_BYTES)
+    assert transport.get_write_buffer_size() > 0
+    transport.abort()
+
+
+async def test_a_protocol_that_fails_takes_nothing_from_the_others(hub: Hub, opened: list[socket.socket]) -> None:
+    pairs = [connected(hub, opened) for _ in range(4)]
+    failures: list[dict[str, object]] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: failures.append(context))
+
+    def fail(_: bytes) -> None:
+        message = "a bug"
+        raise ValueError(message)
+
+    for recorder, _, far in pairs[:2]:
+        recorder.answer = fail
+        far.sendall(b"?")
+    for _, _, far in pairs[2:]:
+        far.sendall(b"?")
+    await until(lambda: all(recorder.received == b"?" for recorder, _, _ in pairs))
+    assert len(failures) == 2
+    for _, transport, _ in pairs:
+        transport.abort()
 
 
 async def test_what_the_kernel_does_not_take_follows_in_order(pair: Pair) -> None:
