@@ -10,9 +10,9 @@ from typing import Annotated
 import typer
 
 from gateway.cli.config_file import ConfigOption, load_or_exit, refuse
-from gateway.service.gateway import serve
 from gateway.service.logs import Level, set_up_logging
 from gateway.service.loops import Loop, loop_factory
+from gateway.service.process import serve
 from gateway.service.snmp import unreadable
 from gateway.service.state_dir import claimed
 
@@ -24,7 +24,10 @@ def command(
     ] = Level.INFO,
     loop: Annotated[Loop, typer.Option(help="The event loop; auto takes uvloop where it is installed.")] = Loop.AUTO,
 ) -> None:
-    """Read the lines and serve the three faces until SIGTERM or Ctrl-C; exit status 78 for a bad configuration."""
+    """Read the lines and serve the three faces until SIGTERM or Ctrl-C.
+
+    Exit status 0 then, 78 for a bad configuration, 70 when a part of the gateway fails again and again.
+    """
     try:
         make_loop = loop_factory(loop)
     except ValueError as error:
@@ -38,4 +41,5 @@ def command(
         if not mine:
             print(f"{config}: another gateway uses the state_dir {checked.state_dir}", file=sys.stderr)
             raise typer.Exit(1)
-        serve(checked, make_loop)
+        if status := serve(checked, make_loop):
+            raise typer.Exit(status)

@@ -14,6 +14,8 @@ Rule 7: after a missed reply its device answers a small question of another kind
         The turn that has to wait for it is held; when there is no answer, it is the turn that has failed.
 Rule 8: a client's read that the device is too busy for (exception 06) is made once more, if there are retries at
         all; every other exception, and a second 06, is the answer.
+Rule 9: a line that stops (`finish`) lets the transaction on the wire run to its end, begins nothing more, and ends
+        all else that waits or comes with 06.
 
 The shell calls `opened`, `closed`, `receive`, `on_timer`, `read` and `write`, then `step` until it returns None,
 writing what it returns, and comes back at `next_deadline`. Outcomes are handed out by `step` only.
@@ -50,6 +52,7 @@ from gateway.errors import (
     QueueTimeout,
     ReplyTimeout,
     RequestError,
+    ShuttingDown,
 )
 from gateway.modbus.collector import Echo
 from gateway.modbus.pdu import Function, is_exception, parse_read
@@ -102,6 +105,7 @@ class LineEngine:
         self._state = LineState.DOWN
         self._state_since = now
         self._error = "not opened yet"
+        self._finishing = False
 
     @property
     def echo(self) -> Echo:
@@ -177,6 +181,15 @@ class LineEngine:
             self._finish([waiter], error)
         return waiter
 
+    @property
+    def busy(self) -> bool:
+        """Whether a transaction is on the wire."""
+        return self._turn is not None
+
+    def finish(self) -> None:
+        """Begin nothing more (rule 9)."""
+        self._finishing = True
+
     def receive(self, data: bytes, now: float) -> None:
         """Bytes came from the line."""
         if self._state is LineState.DOWN:
@@ -199,6 +212,10 @@ class LineEngine:
 
     def step(self, now: float) -> bytes | None:
         """Hand out outcomes, then give the frame to write now, or None."""
+        if self._finishing:
+            held, self._held = self._held, None
+            waiting = self._scheduler.drain()
+            self._finish(waiting if held is None else waiting + _waiters(held), ShuttingDown())
         while self._finished:
             waiter, outcome = self._finished.popleft()
             try:
@@ -231,6 +248,8 @@ class LineEngine:
             return now
         if self._state is LineState.DOWN:
             return None
+        if self._finishing:  # polls are due, and nobody will make them
+            return self._rtu.next_deadline()
         moments = [self._rtu.next_deadline(), self._scheduler.next_expiry()]
         moments += [self._polling.next_warning(record) for record in self._records.values() if record.rewrites]
         if self._turn is None and self._rtu.state is State.IDLE:
@@ -241,6 +260,8 @@ class LineEngine:
     def _check(self, device: Device) -> None:
         """Raise why nothing can be asked of this device now."""
         record = self._records[device.unit_id]
+        if self._finishing:
+            raise ShuttingDown
         if self._state is LineState.DOWN:
             raise LineDown(self._error)
         if record.breaker.is_open:
@@ -252,6 +273,8 @@ class LineEngine:
 
     def _next(self, now: float) -> Turn | None:
         """The turn to make now, or the settling question that must be answered before it (rule 7)."""
+        if self._finishing:
+            return None
         turn, self._held = self._held, None
         if turn is None or not _wanted(turn):
             turn = self._scheduler.next(now)
@@ -353,7 +376,8 @@ class LineEngine:
     def _on_unsettled(self, record: DeviceRecord, error: RequestError, now: float) -> None:
         """The settling question failed, and with it the turn that was held for it (rule 7)."""
         turn, self._held = self._held, None
-        assert turn is not None, "a settling question goes out for a turn only"
+        if turn is None:  # ended by rule 9
+            return
         if isinstance(turn, WriteTurn):
             self._missed(record, error, now)
             silent = isinstance(error, ReplyTimeout)

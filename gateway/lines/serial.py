@@ -63,6 +63,8 @@ class SerialLine:
         self._port: Transport | None = None
         self._failed: asyncio.Future[str] | None = None
         self._down_at: float | None = None
+        self._acted_at = 0.0  # when the engine last had its turn
+        self._idle: asyncio.Future[None] | None = None  # somebody waits until nothing is on the wire
         self._said: set[str] = set()  # why it is down, as logged since it was up
         self._flapping = False  # it was lost within seconds the last time
         for device in devices:
@@ -106,6 +108,19 @@ class SerialLine:
         ticket = self._engine.write(device, pdu, done, self._clock.monotonic(), client=client)
         self._wake_up()
         return ticket
+
+    def overdue_s(self, now: float) -> float:
+        """How long the engine has had something to do and was not let; 0 while the port is not open."""
+        if self._port is None or self._engine.next_deadline(now) is None:
+            return 0.0
+        return max(0.0, now - max(self._deadline, self._acted_at))
+
+    async def finish(self) -> None:
+        """Begin nothing more, answer 06 to what waits, return when nothing is on the wire."""
+        self._engine.finish()
+        self._idle = asyncio.get_running_loop().create_future()
+        self._advance()
+        await self._idle
 
     def _wake_up(self) -> None:
         if self._wake is None:
@@ -182,6 +197,8 @@ class SerialLine:
             self._timer = None
         self._engine.closed(reason, self._clock.monotonic())
         self._engine.step(self._clock.monotonic())  # hands out what ended with the line
+        if self._idle is not None and not self._idle.done():
+            self._idle.set_result(None)
 
     def _woken(self) -> None:
         self._wake = None
@@ -215,7 +232,7 @@ class SerialLine:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        now = self._clock.monotonic()
+        self._acted_at = now = self._clock.monotonic()
         if data:
             self._engine.receive(data, now)
         self._engine.on_timer(now)
@@ -227,6 +244,8 @@ class SerialLine:
             self._reply_by = now if deadline is None else deadline
         if deadline is not None and self._loop is not None:
             self._set_alarm(deadline, self._loop)
+        if self._idle is not None and not self._idle.done() and not self._engine.busy:
+            self._idle.set_result(None)
 
     def _set_alarm(self, deadline: float, loop: asyncio.AbstractEventLoop) -> None:
         now = self._clock.monotonic()

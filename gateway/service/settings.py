@@ -20,8 +20,10 @@ from gateway.service.writes import line_writes, write_rules, write_settings
 
 Pairs = tuple[tuple[str, int], ...]
 
-STOP_GRACE_S = 1.0
-"""How long a stopping face waits for replies under way; the supervisor waits half a second longer."""
+STOP_GRACE_S = 4.0
+"""How long a stopping Modbus face waits for transactions on the wire; the supervisor waits half a second longer."""
+STOP_SCRAPES_S = 1.0
+"""The same of the HTTP face, for scrapes under way."""
 
 
 def line_settings(config: Config) -> tuple[LineSettings, ...]:
@@ -104,7 +106,7 @@ def http_settings(config: Config) -> HttpSettings:
     http = config.http
     return HttpSettings(
         listen=_pairs(http.listen),
-        stop_grace_s=STOP_GRACE_S,
+        stop_grace_s=STOP_SCRAPES_S,
         basic_auth_file=http.basic_auth_file,
         bearer_token_file=http.bearer_token_file,
         tls_certificate=http.tls_certificate,

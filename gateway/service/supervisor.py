@@ -1,12 +1,15 @@
-"""Keeps lines and listeners going, each on its own.
+"""Keeps lines, keepers and listeners going, each on its own.
 
 Rule 1: one that fails never takes another with it. It is tried again after 0.5 s, 1 s, 2 s … at most 10 s.
 Rule 2: an address that cannot be opened is an operating condition: one log line when it begins, one when its
 reason changes or five minutes have passed, one when it is over.
 Rule 3: a task that ends by an exception nobody expected is a bug: counted, logged with its traceback the first
-time it looks like this, restarted all the same.
-Rule 4: stopping is in order: listeners first, so that requests under way get their answers from lines that still
-run, then the lines. What has not stopped in time is left behind; the process ends.
+time it looks like this, restarted all the same. A task that does so `FAILURES` times in `FAILURES_S` is beyond help
+from here: `run` ends and `beyond_help` names it, so that the process can be started anew.
+Rule 4: stopping is in order: listeners take nobody new, lines begin nothing more and answer 06 to what waits, the
+transactions on the wire run to their end and are answered; then connections are closed, then the lines. What has
+not stopped in time is left behind; the process ends.
+Rule 5: `change` stops what is not wanted any more and starts what is new; what stays is not touched.
 """
 
 from __future__ import annotations
@@ -15,104 +18,137 @@ import asyncio
 import json
 import logging
 import traceback
-from collections import Counter
-from collections.abc import Awaitable, Callable, Iterator, Sequence
-from typing import Protocol
+from collections import Counter, defaultdict, deque
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 
 from gateway.clock import Clock
 from gateway.errors import ListenError
+from gateway.service.parts import Line, Listener, Runnable
 
 FIRST_DELAY_S = 0.5
 LAST_DELAY_S = 10.0
 STEADY_S = 60.0  # what ran so long starts again with the first delay
+FAILURES = 5
+FAILURES_S = 60.0
 REMIND_S = 300.0
-STOP_LISTENERS_S = 1.5
-STOP_LINES_S = 1.0
+STOP_LISTENERS_S = 4.5
+STOP_LINES_S = 0.5
 
 _log = logging.getLogger(__name__)
-
-
-class Runnable(Protocol):
-    """A line or the history: runs until it is cancelled, and opens and reopens what it needs by itself."""
-
-    @property
-    def name(self) -> str:
-        """What the log calls its task; of a line the configured name."""
-        ...
-
-    async def run(self) -> None:
-        """Work until cancelled."""
-        ...
-
-
-class Listener(Protocol):
-    """One address of a face."""
-
-    @property
-    def label(self) -> str:
-        """Face and address, such as "modbus 127.0.0.1:1502"."""
-        ...
-
-    @property
-    def bound(self) -> tuple[str, int] | None:
-        """The real address while it listens."""
-        ...
-
-    async def start(self) -> None:
-        """Open the address; ListenError when it cannot be opened. May be tried again."""
-        ...
-
-    async def stop(self) -> None:
-        """Close it and what came in by it."""
-        ...
+Task = asyncio.Task[None]
 
 
 class Supervisor:
-    """Runs lines and listeners until told to stop."""
+    """Runs lines, keepers and listeners until told to stop."""
 
     def __init__(
         self,
         clock: Clock,
-        lines: Sequence[Runnable],
+        lines: Sequence[Line],
         listeners: Sequence[Listener],
         keepers: Sequence[Runnable] = (),
         *,
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> None:
         self._clock = clock
-        self._lines = tuple(lines)
-        self._keepers = tuple(keepers)
-        self._listeners = tuple(listeners)
         self._sleep = sleep
-        self._up: set[int] = set()
+        self._lines: dict[Line, Task | None] = dict.fromkeys(lines)
+        self._keepers: dict[Runnable, Task | None] = dict.fromkeys(keepers)
+        self._listeners: dict[Listener, Task | None] = dict.fromkeys(listeners)
+        self._up: set[Listener] = set()
+        self._tried: set[Listener] = set()
+        self._news = asyncio.Event()  # a listener was tried
         self._seen_bugs: set[str] = set()
+        self._failures: defaultdict[str, deque[float]] = defaultdict(lambda: deque(maxlen=FAILURES))
+        self._over = asyncio.Event()
         self.restarts: Counter[str] = Counter()  # task → how often a bug ended it
+        self.beyond_help = ""  # the task that rule 3 gave up
 
     def down(self) -> tuple[str, ...]:
         """The labels of the listeners that are not open; none means ready, whatever lines and controllers do."""
-        return tuple(listener.label for i, listener in enumerate(self._listeners) if i not in self._up)
+        return tuple(listener.label for listener in self._listeners if listener not in self._up)
+
+    async def settled(self) -> None:
+        """Wait until every listener is open, or was tried."""
+        while not self._tried >= self._listeners.keys():
+            self._news.clear()
+            await self._news.wait()
+
+    def stuck(self, most_s: float) -> tuple[str, ...]:
+        """What does not work although nothing from outside hinders it: its own task is gone, or `most_s` overdue."""
+        now = self._clock.monotonic()
+        tasks = (*self._lines.values(), *self._keepers.values(), *self._listeners.values())
+        gone = [task.get_name() for task in tasks if task is not None and task.done()]
+        late = [f"line {line.name}" for line in self._lines if line.overdue_s(now) > most_s]
+        return (*gone, *late)
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Keep everything going until `stop` is set, then stop it in order; returns in at most about 2.5 s more."""
-        named = [(f"line {line.name}", line) for line in self._lines]
-        named += [(keeper.name, keeper) for keeper in self._keepers]
-        lines = [asyncio.create_task(self._keep_running(name, runnable), name=name) for name, runnable in named]
-        listeners = [
-            asyncio.create_task(self._keep_listener(i, listener), name=listener.label)
-            for i, listener in enumerate(self._listeners)
-        ]
+        """Keep everything going until `stop` is set, then stop it in order; returns in at most about 5 s more."""
+        self._start()
+        told = asyncio.create_task(stop.wait())
+        over = asyncio.create_task(self._over.wait())
         try:
-            await stop.wait()
+            await asyncio.wait((told, over), return_when=asyncio.FIRST_COMPLETED)
         finally:
-            await self._end(listeners, STOP_LISTENERS_S)
-            await self._end(lines, STOP_LINES_S)
+            told.cancel()
+            over.cancel()
+            await self._stop(tuple(self._lines), tuple(self._keepers), tuple(self._listeners))
 
-    async def _end(self, tasks: Sequence[asyncio.Task[None]], timeout_s: float) -> None:
-        for task in tasks:
+    async def change(
+        self,
+        lines: Sequence[Line],
+        listeners: Sequence[Listener],
+        keepers: Sequence[Runnable],
+        turn: Callable[[], None],
+    ) -> None:
+        """Have exactly these from now on (rule 5). `turn` is called when what goes has stopped, before the new begin.
+
+        The address or port of a part that goes can be had by one that comes.
+        """
+        await self._stop(
+            [line for line in self._lines if line not in lines],
+            [keeper for keeper in self._keepers if keeper not in keepers],
+            [listener for listener in self._listeners if listener not in listeners],
+        )
+        turn()
+        self._lines = {line: self._lines.get(line) for line in lines}
+        self._keepers = {keeper: self._keepers.get(keeper) for keeper in keepers}
+        self._listeners = {listener: self._listeners.get(listener) for listener in listeners}
+        self._tried &= self._listeners.keys()
+        self._start()
+
+    def _start(self) -> None:
+        for line, task in self._lines.items():
+            if task is None:
+                name = f"line {line.name}"
+                self._lines[line] = asyncio.create_task(self._keep_running(name, line), name=name)
+        for keeper, task in self._keepers.items():
+            if task is None:
+                self._keepers[keeper] = asyncio.create_task(self._keep_running(keeper.name, keeper), name=keeper.name)
+        for listener, task in self._listeners.items():
+            if task is None:
+                self._listeners[listener] = asyncio.create_task(self._keep_listener(listener), name=listener.label)
+
+    async def _stop(self, lines: Sequence[Line], keepers: Sequence[Runnable], listeners: Sequence[Listener]) -> None:
+        """Rule 4."""
+        until = asyncio.get_running_loop().time() + STOP_LISTENERS_S
+        gates = _tasks(self._listeners[listener] for listener in listeners)
+        for task in gates:
             task.cancel()
+        finishing = [asyncio.create_task(line.finish(), name=f"line {line.name}") for line in lines]
+        await self._ended(gates, STOP_LISTENERS_S)
+        await self._ended(finishing, until - asyncio.get_running_loop().time())
+        ends = _tasks(self._lines[line] for line in lines) + _tasks(self._keepers[keeper] for keeper in keepers)
+        for task in (*finishing, *ends):
+            task.cancel()
+        await self._ended(ends, STOP_LINES_S)
+        for listener in listeners:
+            self._up.discard(listener)
+
+    async def _ended(self, tasks: Sequence[Task], timeout_s: float) -> None:
         if not tasks:
             return
-        ended, late = await asyncio.wait(tasks, timeout=timeout_s)
+        ended, late = await asyncio.wait(tasks, timeout=max(0.0, timeout_s))
         for task in ended:
             error = None if task.cancelled() else task.exception()
             if error is not None:
@@ -136,7 +172,7 @@ class Supervisor:
                 delays = _delays()
             await self._sleep(next(delays))
 
-    async def _keep_listener(self, number: int, listener: Listener) -> None:
+    async def _keep_listener(self, listener: Listener) -> None:
         delays = _delays()
         trouble = _Trouble(listener.label, self._clock)
         while True:
@@ -149,15 +185,22 @@ class Supervisor:
             else:
                 trouble.over(listener.bound)
                 break
+            self._was_tried(listener)
             await self._sleep(next(delays))
-        self._up.add(number)
+        self._up.add(listener)
+        self._was_tried(listener)
         try:
             await asyncio.Event().wait()
         finally:
-            self._up.discard(number)
+            self._up.discard(listener)
             await listener.stop()
 
+    def _was_tried(self, listener: Listener) -> None:
+        self._tried.add(listener)
+        self._news.set()
+
     def _bug(self, task: str, error: Exception) -> None:
+        """Rule 3."""
         self.restarts[task] += 1
         frames = "".join(traceback.format_tb(error.__traceback__))
         first = f"{task}\n{type(error)}\n{frames}" not in self._seen_bugs
@@ -169,6 +212,13 @@ class Supervisor:
             json.dumps(repr(error)),
             exc_info=error if first else None,
         )
+        now = self._clock.monotonic()
+        failures = self._failures[task]
+        failures.append(now)
+        if len(failures) == FAILURES and now - failures[0] <= FAILURES_S and not self.beyond_help:
+            self.beyond_help = task
+            _log.critical('event=giving_up task="%s" failures=%d within_s=%.0f', task, FAILURES, now - failures[0])
+            self._over.set()
 
 
 class _Trouble:
@@ -210,3 +260,7 @@ def _delays() -> Iterator[float]:
     while True:
         yield delay
         delay = min(LAST_DELAY_S, delay * 2)
+
+
+def _tasks(tasks: Iterable[Task | None]) -> list[Task]:
+    return [task for task in tasks if task is not None]

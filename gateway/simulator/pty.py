@@ -53,6 +53,11 @@ class PtyLine:
         return self._device
 
     @property
+    def device(self) -> str:
+        """The pty itself, behind the link; that of the last time while unplugged."""
+        return self._device
+
+    @property
     def plugged(self) -> bool:
         """Whether there is a pty now."""
         return self._master is not None

@@ -22,6 +22,7 @@ from gateway.errors import (
     ReplyTimeout,
     ReplyUnusable,
     RequestError,
+    ShuttingDown,
 )
 from gateway.modbus.pdu import Function, ReadRequest
 from tests.core.virtual_line import MakeLine, VirtualLine
@@ -419,3 +420,41 @@ def test_a_simulated_hour_of_three_devices_takes_seconds(virtual_line: MakeLine)
     assert sum(stats.failed.values()) <= 3  # each device refuses identification once, nothing else
     assert all(math.isclose(device.snapshot.last_reply_at or 0.0, line.now, abs_tol=1.5) for device in line.devices)
     assert took_s < 60
+
+
+def test_a_line_that_stops_ends_the_transaction_on_the_wire_and_refuses_all_else(virtual_line: MakeLine) -> None:
+    line = virtual_line(Registers(1, turnaround_s=0.3))
+    line.run(10.0)
+    outcomes: dict[str, Outcome] = {}
+    device = line.devices[0]
+    line.read(device, registers(0x100, 2), lambda outcome: outcomes.__setitem__("on the wire", outcome))
+    while not any(sent[1][2:4] == b"\x01\x00" for sent in line.sent):
+        line.run(0.01)
+    line.read(device, registers(0x200, 2), lambda outcome: outcomes.__setitem__("waits", outcome))
+    line.engine.finish()
+    line.run(0.01)
+    assert isinstance(outcomes["waits"], ShuttingDown)
+    busy = [line.engine.busy]
+    line.read(device, registers(0x300, 2), lambda outcome: outcomes.__setitem__("came later", outcome))
+    count = len(line.sent)
+    line.run(30.0)
+    assert outcomes["on the wire"] == bytes.fromhex("03 04 0100 0101")
+    assert isinstance(outcomes["came later"], ShuttingDown)
+    assert [*busy, line.engine.busy] == [True, False]
+    assert len(line.sent) == count  # no poll either
+
+
+def test_a_line_that_stops_repeats_nothing(virtual_line: MakeLine) -> None:
+    station = Registers(1)
+    line = virtual_line(station)
+    line.run(10.0)
+    station.silent = True
+    outcomes: list[Outcome] = []
+    line.read(line.devices[0], registers(0x100, 2), outcomes.append)
+    count = len(line.sent)
+    while len(line.sent) == count:
+        line.run(0.01)
+    line.engine.finish()
+    line.run(30.0)
+    assert [type(outcome) for outcome in outcomes] == [ShuttingDown]
+    assert len(line.sent) == count + 1

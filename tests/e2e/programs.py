@@ -28,10 +28,12 @@ DEMO_DEVICES = (("shelter-a", "array-1", 1, 11), ("shelter-a", "array-2", 2, 12)
 class Program:
     """A running process whose standard error can be waited for, line by line."""
 
-    def __init__(self, arguments: Sequence[str]) -> None:
+    def __init__(self, arguments: Sequence[str], **variables: str) -> None:
+        """`variables` are added to the environment."""
         self.process = subprocess.Popen(
             arguments,
             cwd=REPOSITORY,
+            env={**os.environ, **variables},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,

@@ -17,7 +17,7 @@ from gateway.clock import SystemClock
 from gateway.core.site import Device, LineState, Outcome
 from gateway.core.snapshot import DeviceState
 from gateway.devices.schema import load_map
-from gateway.errors import LineDown
+from gateway.errors import LineDown, ShuttingDown
 from gateway.modbus.crc import append_crc, crc_ok
 from gateway.modbus.pdu import Function, ReadRequest
 from tests.lines.rig import ask, make_line, running, until
@@ -213,3 +213,37 @@ async def test_an_unplugged_line_costs_next_to_nothing_and_says_little(
         assert time.process_time() - used < 0.05 * (time.monotonic() - began)
     assert sum("event=line_down" in message for message in caplog.messages) <= 2  # lost, and then not there
     assert not any(record.exc_info for record in caplog.records)
+
+
+async def test_a_line_that_finishes_waits_for_the_wire_and_for_nothing_else(
+    controller: Controller, device: Device
+) -> None:
+    async with running(make_line(controller.link, device)) as line:
+        await until(lambda: device.snapshot.state is DeviceState.ONLINE)
+        async with asyncio.timeout(1.0):
+            await line.finish()
+        assert isinstance(await ask(line, device, 0x200), ShuttingDown)
+        assert line.status(0.0).state is LineState.OPEN
+
+
+async def test_a_line_without_a_port_finishes_at_once(tmp_path: Path, device: Device) -> None:
+    line = make_line(tmp_path / "none", device)
+    async with asyncio.timeout(1.0):
+        await line.finish()
+        async with running(line):
+            await line.finish()
+
+
+async def test_only_a_line_that_could_work_and_does_not_is_overdue(controller: Controller, device: Device) -> None:
+    async with running(make_line(controller.link, device)) as line:
+        later = SystemClock().monotonic() + 1000.0
+        assert line.overdue_s(later) == 0.0  # the port is not open
+        await until(lambda: device.snapshot.state is DeviceState.ONLINE)
+        assert line.overdue_s(SystemClock().monotonic()) < 1.0
+        assert line._timer is not None
+        line._timer.cancel()  # it stands for a mistake of ours: nobody will call the engine again
+        later = SystemClock().monotonic() + 1000.0
+        assert line.overdue_s(later) > 900.0
+        controller.unplug()
+        await until(lambda: line.status(0.0).state is LineState.DOWN)
+        assert line.overdue_s(later) == 0.0

@@ -39,7 +39,15 @@ class FakeLine:
     def __init__(self, time: Time, failures: int, runs_s: float = 0.0) -> None:
         self.time, self.failures, self.runs_s = time, failures, runs_s
         self.running = asyncio.Event()
+        self.finished = False
         self.cancelled = False
+        self.late_s = 0.0
+
+    def overdue_s(self, now: float) -> float:
+        return self.late_s
+
+    async def finish(self) -> None:
+        self.finished = True
 
     async def run(self) -> None:
         if self.failures:
@@ -168,7 +176,96 @@ async def test_listeners_stop_while_the_lines_still_run() -> None:
         await asyncio.sleep(0)
         stop.set()
     assert seen == [False]
+    assert line.finished
     assert line.cancelled
+
+
+async def test_five_failures_in_a_minute_are_beyond_help(caplog: pytest.LogCaptureFixture) -> None:
+    time = Time()
+    line, listener = FakeLine(time, 99), FakeListener("x")
+    supervisor = Supervisor(time, [line], [listener], sleep=time.sleep)
+    await supervisor.run(asyncio.Event())  # nobody stops it
+    assert supervisor.beyond_help == "line a"
+    told = [
+        record.message.split()[0]
+        for record in caplog.records
+        if "task_failed" in record.message or "giving_up" in record.message
+    ]
+    assert told[:6] == ["event=task_failed"] * 5 + ["event=giving_up"]
+    assert listener.bound is None  # it stopped in order all the same
+    assert [record.levelno for record in caplog.records if "giving_up" in record.message] == [logging.CRITICAL]
+
+
+async def test_failures_that_are_far_apart_are_not() -> None:
+    time = Time()
+    line = FakeLine(time, 9, runs_s=module.FAILURES_S / 4)
+    supervisor = Supervisor(time, [line], [], sleep=time.sleep)
+    async with running(supervisor):
+        await line.running.wait()
+    assert supervisor.beyond_help == ""
+
+
+async def test_failures_of_different_tasks_are_not_added_up() -> None:
+    time = Time()
+    line, listener = FakeLine(time, 4), FakeListener("x", [ZeroDivisionError()] * 4)
+    supervisor = Supervisor(time, [line], [listener], sleep=time.sleep)
+    async with running(supervisor):
+        await line.running.wait()
+        await listener.started.wait()
+    assert supervisor.beyond_help == ""
+
+
+async def test_it_is_settled_when_every_listener_was_tried() -> None:
+    time = Time()
+    taken, other = FakeListener("x", [ListenError("taken")] * 100), FakeListener("y")
+    supervisor = Supervisor(time, [], [taken, other], sleep=time.sleep)
+    async with running(supervisor):
+        await supervisor.settled()
+        assert other.bound is not None
+        assert supervisor.down() == ("x",)
+
+
+async def test_a_line_that_is_overdue_and_a_task_that_is_gone_are_stuck() -> None:
+    time = Time()
+    line = FakeLine(time, 0)
+    supervisor = Supervisor(time, [line], [FakeListener("x")], sleep=time.sleep)
+    async with running(supervisor):
+        await line.running.wait()
+        assert supervisor.stuck(10.0) == ()
+        line.late_s = 10.5
+        assert supervisor.stuck(10.0) == ("line a",)
+        line.late_s = 0.0
+        gone = next(task for task in asyncio.all_tasks() if task.get_name() == "x")
+        gone.cancel()  # nobody does that: it stands for a mistake of the supervisor's own
+        await asyncio.wait({gone})
+        assert supervisor.stuck(10.0) == ("x",)
+
+
+async def test_a_change_stops_what_goes_starts_what_comes_and_leaves_the_rest() -> None:
+    time = Time()
+    kept, gone, new = FakeLine(time, 0), FakeLine(time, 0), FakeLine(time, 0)
+    stays, leaves, comes = FakeListener("stays"), FakeListener("leaves"), FakeListener("comes")
+    stays.on_stop = lambda: pytest.fail("touched") if not stopping else None
+    stopping = False
+    supervisor = Supervisor(time, [kept, gone], [stays, leaves], sleep=time.sleep)
+    seen: list[object] = []
+
+    def turn() -> None:
+        seen.append((gone.finished, gone.cancelled, leaves.bound, new.running.is_set(), comes.bound))
+
+    async with running(supervisor):
+        await supervisor.settled()
+        await gone.running.wait()
+        await supervisor.change([new, kept], [stays, comes], [], turn)
+        assert seen == [(True, True, None, False, None)]
+        await supervisor.settled()
+        await new.running.wait()
+        assert (kept.finished, kept.cancelled) == (False, False)
+        assert supervisor.down() == ()
+        stopping = True
+    assert kept.cancelled
+    assert new.cancelled
+    assert comes.bound is None
 
 
 async def test_what_does_not_stop_is_left_behind(

@@ -1,0 +1,88 @@
+"""The life of the process, from start to signal.
+
+Rule 1: the first SIGTERM or SIGINT stops in order (service/supervisor.py), the second ends the process at once.
+        Both leave exit status 0, also while it starts.
+Rule 2: when a part fails again and again, the gateway stops in the same order and leaves exit status 70, upon which
+        systemd starts it anew.
+Rule 3: SIGHUP has the files of Modbus/TCP Security read again (faces/modbus/tls.py). The configuration is read once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+from collections.abc import Callable
+
+from gateway import __version__
+from gateway.clock import SystemClock
+from gateway.service.advice import advice
+from gateway.service.config import Config
+from gateway.service.gateway import Gateway
+from gateway.service.settings import line_budgets
+from gateway.service.systemd import Systemd
+
+EX_SOFTWARE = 70
+"""sysexits.h: an internal mistake was found."""
+
+_log = logging.getLogger(__name__)
+
+
+def serve(config: Config, make_loop: Callable[[], asyncio.AbstractEventLoop]) -> int:
+    """Run the gateway until a signal stops it; the exit status."""
+    with asyncio.Runner(loop_factory=make_loop) as runner:
+        return runner.run(_serve(config))
+
+
+async def _serve(config: Config) -> int:
+    running = asyncio.get_running_loop()
+    stop = asyncio.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        running.add_signal_handler(number, _stopper(number, stop))
+    systemd = Systemd(os.environ)
+    gateway = Gateway(config, SystemClock(), systemd)
+    running.add_signal_handler(signal.SIGHUP, gateway.reload)
+    for text in advice(config, line_budgets(config)):
+        _log.warning('event=advice text="%s"', text.replace('"', "'"))
+    _log.info(
+        'event=started site="%s" version=%s lines=%d devices=%d loop=%s',
+        config.site,
+        __version__,
+        len(gateway.lines),
+        len(gateway.site.devices),
+        type(running).__module__.partition(".")[0],
+    )
+    herald = asyncio.create_task(_announce(gateway, systemd))
+    told = asyncio.create_task(_farewell(stop, systemd))
+    try:
+        await gateway.run(stop)
+    finally:
+        herald.cancel()
+        told.cancel()
+    beyond_help = gateway.supervisor.beyond_help
+    _log.info("event=stopped status=%d", EX_SOFTWARE if beyond_help else 0)
+    return EX_SOFTWARE if beyond_help else 0
+
+
+async def _announce(gateway: Gateway, systemd: Systemd) -> None:
+    """Say that the start is over: everything that listens does so, or was tried."""
+    await gateway.supervisor.settled()
+    closed = gateway.supervisor.down()
+    systemd.ready(f"{len(closed)} listeners are not open" if closed else "serving")
+
+
+async def _farewell(stop: asyncio.Event, systemd: Systemd) -> None:
+    await stop.wait()
+    systemd.stopping()
+
+
+def _stopper(number: signal.Signals, stop: asyncio.Event) -> Callable[[], None]:
+    def on_signal() -> None:
+        if stop.is_set():
+            logging.shutdown()
+            os._exit(0)  # whoever signals twice does not want to wait for anything
+        _log.info("event=stopping signal=%s", number.name)
+        stop.set()
+
+    return on_signal

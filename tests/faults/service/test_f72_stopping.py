@@ -1,0 +1,94 @@
+"""F72: SIGTERM with clients, a transaction on the wire, reads that wait, half-open connections of every kind."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+
+import pytest
+
+from tests.faces.modbus.tls.conftest import pki
+from tests.faces.modbus.tls.site import Pki
+from tests.faults.service.rig import QUIET, Service, client, read
+
+__all__ = ["pki"]
+
+
+async def test_the_wire_is_waited_for_the_queue_is_06_and_nobody_new_gets_in(service: Service) -> None:
+    service.configure()
+    program = service.start()
+    await service.online()
+    unit = service.units["shelter-a"][0]
+    unit.turnaround_s = 1.0
+    async with client(service.modbus) as on_the_wire, client(service.modbus) as waits, client(service.modbus) as idle:
+        on_the_wire.ask(11, read(0xE000, 2))
+        await unit.is_asked(read(0xE000, 2))
+        await asyncio.sleep(0.15)  # what was polled is older than max_age_s
+        waits.ask(11, read(0x0000, 8, function=1))
+        waits.ask(11, read(0xE010, 2))
+        await asyncio.sleep(0.1)
+        began = time.monotonic()
+        program.process.terminate()
+        assert await waits.reply() == b"\x81\x06"
+        assert await waits.reply() == b"\x83\x06"
+        assert time.monotonic() - began < 0.4
+        assert await waits.reply() == b""
+        assert await idle.reply() == b""
+        with pytest.raises(OSError):
+            await asyncio.open_connection("127.0.0.1", service.modbus)
+        expected = b"\x03\x04" + b"".join(unit.word(at).to_bytes(2) for at in (0xE000, 0xE001))
+        assert await on_the_wire.reply() == expected
+        assert await on_the_wire.reply() == b""
+    assert await service.end() == 0
+    assert time.monotonic() - began < 3.0
+    assert "Traceback" not in program.log()
+    assert "stop_late" not in program.log()
+
+
+async def test_a_controller_that_takes_for_ever_is_given_up_after_five_seconds(service: Service) -> None:
+    service.configure(line_keys="baudrate = 115200\nreply_timeout_s = 10.0")
+    program = service.start()
+    await service.online()
+    unit = service.units["shelter-a"][0]
+    unit.turnaround_s = 60.0
+    async with client(service.modbus) as asker:
+        asker.ask(11, read(0xE000, 2))
+        await unit.is_asked(read(0xE000, 2))
+        began = time.monotonic()
+        program.process.terminate()
+        assert await asker.reply() == b"\x83\x06"
+        assert await asker.reply() == b""
+    assert await service.end() == 0
+    assert time.monotonic() - began < 6.0
+    assert "Traceback" not in program.log()
+
+
+async def test_half_handshakes_and_half_requests_hold_up_nothing(
+    service: Service, pki: Pki, free_tcp_port: Callable[[], int]
+) -> None:
+    files = pki.files()
+    tls_port = free_tcp_port()
+    service.configure(
+        rest=f"""{QUIET}[modbus.tls]
+listen = ["127.0.0.1:{tls_port}"]
+certificate_file = "{files.certificate}"
+key_file = "{files.key}"
+client_ca_file = "{files.client_ca}"
+"""
+    )
+    program = service.start()
+    await service.online()
+    async with client(tls_port) as silent, client(tls_port) as half, client(service.modbus) as frame:
+        half.send(b"\x16\x03\x01\x02\x00\x01")  # the beginning of a ClientHello
+        frame.send(b"\x00\x01\x00\x00\x00")
+        async with client(service.http) as scraper:
+            scraper.send(b"GET /metrics HT")
+            await asyncio.sleep(0.1)
+            began = time.monotonic()
+            program.process.terminate()
+            for one in (silent, half, frame, scraper):
+                assert await one.reply() == b""
+    assert await service.end() == 0
+    assert time.monotonic() - began < 3.0
+    assert "Traceback" not in program.log()

@@ -1,0 +1,44 @@
+"""F73: a second signal, of either kind, ends the process at once and quietly; so does one while it starts."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import time
+
+import pytest
+
+from tests.faults.service.rig import Service, client, read
+
+
+@pytest.mark.parametrize("second", [signal.SIGTERM, signal.SIGINT])
+async def test_a_second_signal_does_not_wait(service: Service, second: signal.Signals) -> None:
+    service.configure()
+    program = service.start()
+    await service.online()
+    unit = service.units["shelter-a"][0]
+    unit.turnaround_s = 30.0
+    async with client(service.modbus) as asker:
+        asker.ask(11, read(0xE000, 2))
+        await unit.is_asked(read(0xE000, 2))
+        program.process.terminate()
+        await service.log("event=stopping signal=SIGTERM")
+        began = time.monotonic()
+        assert await service.end(second) == 0
+        assert time.monotonic() - began < 0.5
+    assert "Traceback" not in program.log()
+
+
+async def test_a_signal_at_any_moment_of_the_start_ends_it_quietly(service: Service) -> None:
+    service.configure()
+    began = time.monotonic()
+    program = service.start()
+    await service.log("event=line_up")
+    assert await service.end() == 0
+    whole_s = time.monotonic() - began
+    for part in (0.4, 0.7, 0.9):
+        program = service.start()
+        await asyncio.sleep(part * whole_s)
+        status = await service.end()
+        assert status in {0, -signal.SIGTERM}  # before Python itself is up nobody handles signals
+        assert "Traceback" not in program.log()

@@ -1,0 +1,58 @@
+"""F74: systemd hears when the start is over, while all works, and when it ends; dead hardware is none of it."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+
+from tests.faults.service.rig import QUIET, NotifySocket, Service
+
+
+async def test_ready_alive_stopping(service: Service, systemd: NotifySocket) -> None:
+    service.configure()
+    program = service.start(NOTIFY_SOCKET=systemd.path, WATCHDOG_USEC="400000")
+    ready = await systemd.next("READY=1")
+    assert ready == "READY=1\nSTATUS=serving"
+    assert (await service.get("/readyz"))[0] == 200  # it is true when it is said
+    loop = asyncio.get_running_loop()
+    began = loop.time()
+    for _ in range(8):
+        await systemd.next("WATCHDOG=1")
+    assert 0.5 < loop.time() - began < 2.0
+    program.process.terminate()
+    await systemd.next("STOPPING=1")
+    assert await service.end() == 0
+
+
+async def test_an_unplugged_line_and_a_dead_controller_do_not_starve_it(
+    service: Service, systemd: NotifySocket
+) -> None:
+    service.configure(
+        devices=(("shelter-a", "array-1", 1, 11), ("shelter-a", "ghost", 9, 19), ("shelter-b", "array-3", 1, 13)),
+        line_keys="baudrate = 115200\nreply_timeout_s = 0.1",
+        rest="[poll]\nlive_s = 0.2\n",
+    )
+    service.start(NOTIFY_SOCKET=systemd.path, WATCHDOG_USEC="400000")
+    await systemd.next("READY=1")
+    await service.log("device_offline .*device=ghost")
+    service.lines["shelter-a"].unplug()
+    await service.log("line_down line=shelter-a")
+    for _ in range(12):
+        await systemd.next("WATCHDOG=1")
+    assert (await service.get("/healthz"))[0] == 200
+    assert (await service.get("/readyz"))[0] == 200
+
+
+async def test_a_loop_that_stands_still_starves_it(service: Service, systemd: NotifySocket) -> None:
+    service.configure(rest=QUIET)
+    program = service.start(NOTIFY_SOCKET=systemd.path, WATCHDOG_USEC="200000")
+    await systemd.next("WATCHDOG=1")
+    program.process.send_signal(signal.SIGSTOP)
+    try:
+        await asyncio.sleep(0.2)  # what was sent before it stood still
+        systemd.drain()
+        await asyncio.sleep(0.5)
+        assert systemd.drain() == []
+    finally:
+        program.process.send_signal(signal.SIGCONT)
+    await systemd.next("WATCHDOG=1")
