@@ -99,7 +99,10 @@ def _snmp(config: Config) -> Iterator[str]:
     yield from snmp_advice(config)
     if parse_root(snmp.enterprise_root)[: len(DOCUMENTATION_ROOT)] == DOCUMENTATION_ROOT:
         yield "snmp.enterprise_root: 32473 is the number for documentation; use your own enterprise number in service"
-    for path, text in _named("snmp.listen", _beyond_loopback(snmp.listen) if snmp.community else ()):
+    listens = [("snmp.listen", snmp.listen)]
+    listens += [(f"snmp.emc1[{index}].listen", each.listen) for index, each in enumerate(snmp.emc1)]
+    exposed = [found for key, texts in listens for found in _named(key, _beyond_loopback(texts))]
+    for path, text in exposed if snmp.community else ():
         yield f"{path}: {text} can be reached from other machines, and SNMP v2c sends the community in clear"
     for index, community in enumerate(snmp.community):
         networks = [ipaddress.ip_network(source) for source in community.source]

@@ -11,6 +11,7 @@ import ipaddress
 from collections.abc import Iterator, Mapping
 
 from gateway.devices.schema import load_map, models
+from gateway.service.emc1 import emc1_problems
 from gateway.service.problems import Path, Problem, render_path, show, table_at
 from gateway.service.schema import NOT_SUPPORTED, Address, parse_listen
 from gateway.service.schema_tls import TlsTable
@@ -42,6 +43,9 @@ def cross_problems(raw: Raw) -> list[Problem]:
     problems += _repeated(((*path, "name"), table.get("name")) for path, table in users)
     problems += _repeated(((*path, "name"), table.get("name")) for path, table in views)
     problems += snmp_problems(users, communities, views)
+    emc1 = list(_tables(snmp, "emc1", ("snmp",)))
+    problems += _repeated(((*path, "unit_id"), table.get("unit_id")) for path, table in emc1)
+    problems += emc1_problems(emc1, devices)
     problems += _line_listeners(raw, [line.get("name") for _, line in lines])
     problems += _listen_clashes(raw, ("modbus", "http"))
     problems += _listen_clashes(raw, ("snmp",))
@@ -139,7 +143,7 @@ def _listens(raw: Raw, face: str) -> Iterator[tuple[Path, object]]:
     assert table is not None
     own = _table(raw, face)
     tables: list[tuple[Path, object]] = [((face,), own.get("listen", list(table.model_fields["listen"].default)))]
-    tables += [(path, listener.get("listen")) for path, listener in _tables(own, "listener", (face,))]
+    tables += [(path, each.get("listen")) for key in ("listener", "emc1") for path, each in _tables(own, key, (face,))]
     tls = own.get("tls")
     if isinstance(tls, Mapping):
         tables.append(((face, "tls"), tls.get("listen", list(TlsTable.model_fields["listen"].default))))

@@ -40,7 +40,7 @@ from gateway.service.keys import (
     parse_range,
     parse_root,
 )
-from gateway.service.schema_snmp import CommunityTable, SnmpTable, UserTable, ViewTable
+from gateway.service.schema_snmp import CommunityTable, Emc1Table, SnmpTable, UserTable, ViewTable
 from gateway.service.schema_tls import ROLES, Roles, TlsTable
 
 __all__ = [
@@ -53,6 +53,7 @@ __all__ = [
     "CommunityTable",
     "Config",
     "DeviceTable",
+    "Emc1Table",
     "HistoryTable",
     "HttpTable",
     "Key",

@@ -100,6 +100,21 @@ class UserTable(Table):
     view: Annotated[ViewName, Key(_VIEW, "What it may read.")] = ""
 
 
+class Emc1Table(Table):
+    """`[[snmp.emc1]]`: a controller that is shown also as Morningstar's EMC-1 would show it; none by default."""
+
+    unit_id: Annotated[int, Key("the unit_id of a device whose model that converter knows", "Which controller.")] = (
+        Field(ge=1, le=247)
+    )
+    listen: Annotated[
+        Listens,
+        Key(
+            'a list of "IPv4:port" or "[IPv6]:port" of its own such as "127.0.0.1:1162"',
+            "Where it is what is asked for (UDP); elsewhere it is by community NAME@unit_id, or by context unit_id.",
+        ),
+    ] = ()
+
+
 class SnmpTable(Table):
     """`[snmp]`: the SNMP face; its port is opened only when there is a community or a user."""
 
@@ -137,4 +152,8 @@ class SnmpTable(Table):
     view: Annotated[
         Annotated[tuple[ViewTable, ...], Field(strict=False)],
         Key("[[snmp.view]] tables", "Parts of the tree, for communities and users that may not read all."),
+    ] = ()
+    emc1: Annotated[
+        Annotated[tuple[Emc1Table, ...], Field(strict=False)],
+        Key("[[snmp.emc1]] tables", "Controllers that are shown also as Morningstar's EMC-1 would show them."),
     ] = ()

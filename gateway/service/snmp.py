@@ -16,6 +16,7 @@ from gateway.errors import ConfigError
 from gateway.faces.snmp.secret import Secret
 from gateway.faces.snmp.settings import EVERYTHING, Community, SnmpSettings, User, View
 from gateway.faces.snmp.usm import MIN_PASS_PHRASE, Auth, Credentials, Priv, fits
+from gateway.service.emc1 import emc1_devices
 from gateway.service.keys import parse_oid
 from gateway.service.problems import Path, Problem, show
 from gateway.service.schema import Config, UserTable, parse_listen, parse_root
@@ -53,6 +54,7 @@ def snmp_settings(config: Config) -> SnmpSettings:
         state_dir=FilePath(config.state_dir),
         renew_engine=snmp.engine_lost == "new",
         requests_per_s=snmp.requests_per_s,
+        emc1=emc1_devices(config, listen=snmp_on(config)),
     )
 
 

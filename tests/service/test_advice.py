@@ -60,6 +60,10 @@ def test_a_file_that_is_as_it_should_be_needs_none() -> None:
             CLEAN.replace("[snmp]\n", '[snmp]\nlisten = ["192.0.2.1:161"]\n'),
             "snmp.listen[0]: 192.0.2.1:161 can be reached from other machines, and SNMP v2c sends the community in",
         ),
+        (
+            CLEAN + '[[snmp.emc1]]\nunit_id = 1\nlisten = ["192.0.2.1:162"]\n',
+            "snmp.emc1[0].listen[0]: 192.0.2.1:162 can be reached from other machines, and SNMP v2c sends the",
+        ),
         (CLEAN.replace("127.0.0.0/8", "0.0.0.0/0"), "snmp.community[0].source[0]: 0.0.0.0/0 is everybody"),
         (
             CLEAN.replace("127.0.0.0/8", "10.0.0.0/8").replace("k7-reader", "public"),

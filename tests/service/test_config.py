@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from ipaddress import ip_network
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from gateway.core.ratelimit import ClientRate, LineRates
+from gateway.devices.schema import load_map
 from gateway.errors import ConfigError
 from gateway.faces.modbus.admission import rate_of
 from gateway.faces.modbus.settings import LineListen, ModbusSettings
@@ -261,6 +263,22 @@ listen = ["127.0.0.1:70000"]
             'snmp.community[0].view: there is no view "x"; allowed: none',
         ),
         (
+            MINIMAL + "[[snmp.emc1]]\nunit_id = 12\n",
+            "snmp.emc1[0].unit_id: no device has unit_id 12; allowed: 11",
+        ),
+        (MINIMAL + "[[snmp.emc1]]\nunit_id = 0\n", "snmp.emc1[0].unit_id: 0 is out of range; allowed: the unit_id of"),
+        (MINIMAL + '[[snmp.emc1]]\nlisten = ["::1:1"]\n', 'snmp.emc1[0].listen[0]: "::1:1" is not allowed; allowed: a'),
+        (MINIMAL + "[[snmp.emc1]]\nport = 1162\n", "snmp.emc1[0].unit_id: is missing"),
+        (MINIMAL + "[[snmp.emc1]]\nunit_id = 11\nport = 1\n", "snmp.emc1[0].port: unknown key; allowed: unit_id, list"),
+        (
+            MINIMAL + "[[snmp.emc1]]\nunit_id = 11\n" * 2,
+            "snmp.emc1[1].unit_id: 11 is already used by snmp.emc1[0].unit_id; allowed: a value of its own",
+        ),
+        (
+            MINIMAL + '[[snmp.emc1]]\nunit_id = 11\nlisten = ["0.0.0.0:1161"]\n',
+            'snmp.emc1[0].listen[0]: "0.0.0.0:1161" clashes with snmp.listen[0]; allowed: another address or port',
+        ),
+        (
             MINIMAL + '[[snmp.notify]]\nkind = "trap"\n',
             "snmp.notify: traps and informs are not supported in this version",
         ),
@@ -394,6 +412,13 @@ def test_udp_and_tcp_do_not_clash_but_a_default_may() -> None:
     parse_config(MINIMAL + '[snmp]\nlisten = ["127.0.0.1:1502"]\n')
     (found,) = problems(MINIMAL + '[modbus]\nlisten = ["127.0.0.1:9850"]\n')
     assert found.startswith('http.listen[0]: "127.0.0.1:9850" clashes with modbus.listen[0];')
+
+
+def test_a_model_that_an_emc1_does_not_know_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    unknown = replace(load_map("prostar-mppt"), emc1_root=None)
+    monkeypatch.setattr("gateway.service.emc1.load_map", lambda _model: unknown)
+    (found,) = problems(MINIMAL + "[[snmp.emc1]]\nunit_id = 11\n")
+    assert found == 'snmp.emc1[0].unit_id: the EMC-1 knows no "prostar-mppt"; allowed: none'
 
 
 def test_a_syntax_error_has_its_place(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "`[[snmp.community]]`": schema.CommunityTable,
     "`[[snmp.user]]`": schema.UserTable,
     "`[[snmp.view]]`": schema.ViewTable,
+    "`[[snmp.emc1]]`": schema.Emc1Table,
     "`[http]`": schema.HttpTable,
     "`[history]`": schema.HistoryTable,
 }

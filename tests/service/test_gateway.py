@@ -12,6 +12,7 @@ import pytest
 from gateway.clock import SystemClock
 from gateway.core.budget import WATCH_S
 from gateway.core.identity import Identity
+from gateway.faces.snmp.settings import Emc1Device
 from gateway.service.config import Config, parse_config
 from gateway.service.gateway import Gateway
 from gateway.service.loops import Loop, loop_factory
@@ -218,3 +219,17 @@ def test_without_uvloop_it_runs_unless_asked_for(
             loop_factory(choice)
     else:
         assert loop_factory(choice) is asyncio.new_event_loop
+
+
+def test_an_emc1_view_has_a_port_of_its_own_where_somebody_may_read() -> None:
+    view = '[[snmp.emc1]]\nunit_id = 12\nlisten = ["127.0.0.1:0", "[::1]:0"]\n'
+    config = parse_config(TEXT + view)
+    assert snmp_settings(config).emc1 == (Emc1Device(12, (("127.0.0.1", 0), ("::1", 0))),)
+    labels = [listener.label for listener in Gateway(config, SystemClock()).listeners]
+    assert [label for label in labels if label.startswith("snmp")] == [
+        "snmp 127.0.0.1:0",
+        "snmp for unit 12 127.0.0.1:0",
+        "snmp for unit 12 [::1]:0",
+    ]
+    nobody = parse_config(TEXT.partition("[[snmp.community]]")[0] + view)
+    assert snmp_settings(nobody).emc1 == (Emc1Device(12),)

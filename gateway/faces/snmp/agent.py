@@ -21,6 +21,7 @@ from gateway.core.stats import ModbusServerStats
 from gateway.errors import ListenError
 from gateway.faces.snmp import entity, standard
 from gateway.faces.snmp.counters import SnmpCounters
+from gateway.faces.snmp.emc1 import context_of, emc1_tree
 from gateway.faces.snmp.engine import Engine, EngineLost, start_engine
 from gateway.faces.snmp.layout import Layout, shipped_layout
 from gateway.faces.snmp.objects import Gateway
@@ -76,10 +77,20 @@ class SnmpAgent:
         )
         groups = (*standard.GROUPS, entity.GENERAL)
         self.tree: Tree = whole(self.layout, described, groups, (standard.CAPABILITIES, *entity.TABLES))
-        contexts: Mapping[bytes, Tree] = {b"": self.tree}
+        contexts: Mapping[bytes, Tree] = {b"": self.tree} | {
+            context_of(each.unit_id): emc1_tree(described, site.by_unit[each.unit_id]) for each in settings.emc1
+        }
+        self._trees = tuple(contexts.values())
         self._responder = Responder(settings, contexts, self.counters)
         self._throttle = Throttle()
-        self.listeners = tuple(SnmpListener(self, host, port) for host, port in settings.listen)
+        self.listeners = (
+            *(SnmpListener(self, host, port) for host, port in settings.listen),
+            *(
+                SnmpListener(self, host, port, context_of(each.unit_id))
+                for each in settings.emc1
+                for host, port in each.listen
+            ),
+        )
         self._warm_up()
 
     def engine(self) -> Engine:
@@ -157,20 +168,25 @@ class SnmpAgent:
     def _warm_up(self) -> None:
         """Encode every cell and answer every kind of request once, so that no first request waits for it."""
         now = self._clock.monotonic()
-        for slot in self.tree:
-            slot.varbind(now)
+        for tree in self._trees:
+            for slot in tree:
+                slot.varbind(now)
         self._responder.rehearse(now)
 
 
 class SnmpListener:
-    """One bound UDP socket of the agent; `start` may be tried again after a failure, or after `stop`."""
+    """One bound UDP socket of the agent; `start` may be tried again after a failure, or after `stop`.
 
-    def __init__(self, agent: SnmpAgent, host: str, port: int) -> None:
+    What comes here is about `context` unless it asks for another one.
+    """
+
+    def __init__(self, agent: SnmpAgent, host: str, port: int, context: bytes = b"") -> None:
         self._agent = agent
+        self._context = context
         self._host = host
         self._port = port
         shown = f"[{host}]" if ":" in host else host
-        self.label = f"snmp {shown}:{port}"
+        self.label = f"snmp{f' for unit {context.decode()}' if context else ''} {shown}:{port}"
         self._socket: socket.socket | None = None
 
     @property
@@ -204,7 +220,7 @@ class SnmpListener:
                 sock.close()
             raise ListenError(f"{self.label} (UDP): {error.strerror or error}") from error
         self._socket = sock
-        loop.add_reader(sock, self._agent.answer_waiting, sock)
+        loop.add_reader(sock, self._agent.answer_waiting, sock, self._context)
 
     async def stop(self) -> None:
         """Close the socket; a listener that is not started stays so."""

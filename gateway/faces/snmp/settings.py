@@ -64,6 +64,14 @@ class User:
     view: View = EVERYTHING
 
 
+@dataclass(frozen=True, slots=True)
+class Emc1Device:
+    """A device that is also shown as Morningstar's EMC-1 would (`emc1.py`), and where that is so by default."""
+
+    unit_id: int
+    listen: tuple[tuple[str, int], ...] = ()
+
+
 REPLY_LIMIT = 1400
 """Octets of the longest reply: fits a frame over IPv6 and a tunnel, so it is never cut on the way."""
 
@@ -83,3 +91,4 @@ class SnmpSettings:
     renew_engine: bool = True  # whether a lost engine id is replaced by a new one; otherwise SNMPv3 stays off
     requests_per_s: float = 2000.0  # of one source in the long run; ten seconds' worth may come at once
     reply_octets: int = REPLY_LIMIT
+    emc1: tuple[Emc1Device, ...] = ()

@@ -175,9 +175,12 @@ class Window:
 class Tree(Window):
     """Everything the agent can answer."""
 
-    def __init__(self, gateway: Gateway, groups: Sequence[ScalarGroup], tables: Sequence[Table]) -> None:
+    def __init__(
+        self, gateway: Gateway, groups: Sequence[ScalarGroup], tables: Sequence[Table], single: Row | None = None
+    ) -> None:
+        """`single` is what the scalars are of, when not of the gateway."""
         slots = [
-            Slot((*group.base, described.number, 0), described, gateway)
+            Slot((*group.base, described.number, 0), described, gateway if single is None else single)
             for group in groups
             for described in group.objects
         ]
