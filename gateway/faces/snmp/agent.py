@@ -112,7 +112,9 @@ class SnmpAgent:
         except EngineLost as error:
             _log.error('event=snmp_v3_off reason="%s"', error)
             return
-        self._responder.security = Security(engine, [user.credentials for user in users], self.counters)
+        self._responder.security = Security(
+            engine, [user.credentials for user in users], self.counters, self._settings.reply_octets
+        )
         _log.info("event=snmp_v3_on engine_id=%s boots=%d users=%d", engine.engine_id.hex(), engine.boots, len(users))
 
     def answer(self, data: bytes, host: str, context: bytes = b"") -> bytes | None:

@@ -62,7 +62,9 @@ SHORT_WORDS: Mapping[str, str] = {
     "threshold": "limit",
     "voltage": "volt",
 }
-"""Shorter words for names that would pass NAME_LIMIT; only appended to, since names are for ever."""
+"""Shorter words for names that would pass NAME_LIMIT, as few of them as it takes, the last word first; only appended
+to, since names are for ever.
+"""
 
 _POINT_TABLES: tuple[tuple[int, str, Group, str], ...] = (
     (4, "pgwLive", Group.LIVE, "Live values of each device. A cell is instantiated only while the device is online."),
@@ -175,9 +177,13 @@ def camel(words: str) -> str:
 
 def object_name(point: str) -> str:
     """Descriptor of a point's column; MapError when even with short words it is too long."""
+    words = point.split("_")
     name = PREFIX + camel(point)
-    if len(name) > NAME_LIMIT:
-        name = PREFIX + camel("_".join(SHORT_WORDS.get(word, word) for word in point.split("_")))
+    for at in reversed(range(len(words))):
+        if len(name) <= NAME_LIMIT:
+            break
+        words[at] = SHORT_WORDS.get(words[at], words[at])
+        name = PREFIX + camel("_".join(words))
     if len(name) > NAME_LIMIT:
         raise MapError(f"point {point}: {name} is longer than {NAME_LIMIT} letters; allowed: a shorter point name")
     return name

@@ -8,6 +8,8 @@ Rules:
    level is left at which access would have to be refused later.
 3. A user that is known but not from this address does not exist here.
 4. A message that is authentic and does not decrypt to a scoped PDU was encrypted with another key: decryptionErrors.
+5. Who has passed once is opened by the short way (`askers.py`), which compares what it does not read; what it does not
+   expect goes the whole way, which is the only one that rejects.
 """
 
 from __future__ import annotations
@@ -15,8 +17,10 @@ from __future__ import annotations
 import hmac
 from collections.abc import Container, Iterable
 from enum import Enum
+from typing import Self
 
 from gateway.faces.snmp import v3, wire
+from gateway.faces.snmp.askers import Askers
 from gateway.faces.snmp.counters import SnmpCounters
 from gateway.faces.snmp.engine import MAX_BOOTS, Engine
 from gateway.faces.snmp.reader import NotSnmp, content
@@ -61,27 +65,41 @@ class Rejected(Exception):
 
 
 class Opened:
-    """A message of an authenticated user, decrypted."""
+    """A message of an authenticated user, decrypted; `room` is what its asker and the limit leave for a PDU."""
 
-    __slots__ = ("message", "plain", "scope", "user")
+    __slots__ = ("context", "flags", "message_id", "pdu_at", "plain", "room", "user")
 
-    def __init__(self, message: v3.Message, user: LocalUser, plain: bytes, scope: v3.Scope) -> None:
-        self.message = message
+    def __init__(self, user: LocalUser, message_id: bytes, flags: int, room: int) -> None:
         self.user = user
+        self.message_id = message_id  # encoded INTEGER
+        self.flags = flags
+        self.room = room
+        self.plain = b""
+        self.context = b""
+        self.pdu_at = 0
+
+    def decrypted(self, plain: bytes, context: bytes, pdu_at: int) -> Self:
+        """The same with the scoped PDU, the name of its context, and where the PDU begins in it."""
         self.plain = plain
-        self.scope = scope
+        self.context = context
+        self.pdu_at = pdu_at
+        return self
 
 
 class Security:
     """The users of one engine."""
 
-    def __init__(self, engine: Engine, users: Iterable[Credentials], counters: SnmpCounters) -> None:
+    def __init__(self, engine: Engine, users: Iterable[Credentials], counters: SnmpCounters, limit: int) -> None:
+        """A reply has at most `limit` octets, whatever its asker takes."""
         self.engine = engine
         self._counters = counters
+        self._limit = limit
         self._users = {each.name: LocalUser(each, engine.engine_id) for each in users}
         self._sealers = {name: v3.Sealer(user) for name, user in self._users.items()}
         self._clear = v3.Sealer(None)
         self._authority = v3.Authority(engine.engine_id, engine.boots, 0)
+        self._askers = Askers()
+        self._scope = v3.scoped(engine.engine_id, b"", b"")[2:]  # engine id and name of the default context
 
     def open(self, message: v3.Message, usable: Container[bytes], now: float) -> Opened:
         """Check and decrypt a message; `usable` are the names that count where it came from. Raises Rejected."""
@@ -100,30 +118,54 @@ class Security:
             raise self.rejected(Rejection.LEVEL, message, now)
         if not self._authentic(message, user):
             raise self.rejected(Rejection.DIGEST, message, now)
-        if (
-            message.boots != engine.boots
-            or engine.boots >= MAX_BOOTS
-            or abs(message.time - engine.time(now)) > TIME_WINDOW_S
-        ):
+        if message.boots != engine.boots or engine.boots >= MAX_BOOTS or not self._timely(message.time, now):
             raise self.rejected(Rejection.TIME_WINDOW, message, now, user, v3.AUTH)
         plain, scope = self._decrypted(message, user, now)
         if scope.engine_id != engine.engine_id:
             raise self.rejected(Rejection.CONTEXT_ENGINE, message, now, user, v3.AUTH | v3.PRIV)
-        return Opened(message, user, plain, scope)
+        most = min(self._limit, message.max_size) - self._overhead(user)
+        self._askers.learn(message, user, most)
+        opened = Opened(user, message.message_id, flags, most - len(scope.context))
+        return opened.decrypted(plain, scope.context, scope.pdu_at)
+
+    def open_known(self, data: bytes, usable: Container[bytes], now: float) -> Opened | None:
+        """What `open` makes of a message to the default context by who passed it before; None: `open` has to look."""
+        found = self._askers.open(data)
+        if found is None:
+            return None
+        asker, message_id, plain = found
+        if asker.user.name not in usable or not self._timely(asker.time, now):
+            return None
+        size = plain[1]
+        start = 2 if size < 0x80 else size - 0x7E
+        scope = self._scope
+        if not plain.startswith(scope, start) or plain[:start] != wire.head(0x30, len(plain) - start):
+            return None
+        return Opened(asker.user, message_id, asker.flags, asker.room).decrypted(plain, b"", start + len(scope))
 
     def reply(self, opened: Opened, pdu: bytes, now: float) -> bytes:
         """The message that answers `opened` with `pdu`."""
-        body = v3.scoped(self.engine.engine_id, opened.scope.context, pdu)
+        if opened.context:
+            body = v3.scoped(self.engine.engine_id, opened.context, pdu)
+        else:
+            body = wire.head(0x30, len(self._scope) + len(pdu)) + self._scope + pdu
         sealer = self._sealers[opened.user.name]
-        return sealer.seal(self._authority_at(now), opened.message.message_id, v3.AUTH | v3.PRIV, body)
+        return sealer.seal(self._authority_at(now), opened.message_id, v3.AUTH | v3.PRIV, body)
 
-    def overhead(self, opened: Opened) -> int:
-        """Octets of a reply around its PDU, at most."""
-        sizes = len(self.engine.engine_id) * 2 + len(opened.user.name) + opened.user.mac.size
-        return 100 + sizes + len(opened.scope.context)
+    def _overhead(self, user: LocalUser) -> int:
+        """Octets of a reply in the default context around the varbinds, at most."""
+        return 138 + len(self.engine.engine_id) * 2 + len(user.name) + user.mac.size
+
+    def _timely(self, time: int, now: float) -> bool:
+        return -TIME_WINDOW_S <= time - self.engine.time(now) <= TIME_WINDOW_S
 
     def rejected(
-        self, rejection: Rejection, message: v3.Message, now: float, user: LocalUser | None = None, flags: int = 0
+        self,
+        rejection: Rejection,
+        message: v3.Message | Opened,
+        now: float,
+        user: LocalUser | None = None,
+        flags: int = 0,
     ) -> Rejected:
         """Count, and make the exception with the report that is due, sent at the level that `flags` say."""
         count = getattr(self._counters, rejection.field) + 1

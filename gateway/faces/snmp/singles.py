@@ -44,12 +44,13 @@ class Single:
         self._id_size = len(request.request_id) - 2
         self._envelopes: dict[int, tuple[bytes, bytes]] = {}  # by the size of the varbind
 
-    def reply(self, request_id: bytes, tail: bytes, now: float) -> bytes | None:
-        """The reply, None when it takes the long way; `request_id` are the octets of it."""
+    def reply(self, data: bytes, at: int, now: float) -> bytes | None:
+        """The reply to a request whose request id begins at `at`, None when it takes the long way."""
         window = self.window
-        if len(tail) != self._size or tail[:10] != self._frame or tail[-2:] != _NULL:
+        tail = at + self._id_size
+        if len(data) != tail + self._size or not data.startswith(self._frame, tail) or not data.endswith(_NULL):
             return None
-        place = window.places.get(tail[10:-2])
+        place = window.places.get(data[tail + 10 : -2])
         if place is None:
             return None
         if self._next:
@@ -70,7 +71,7 @@ class Single:
             if len(varbind) > self.room:
                 return None
             envelope = self._envelopes[len(varbind)] = self._enveloped(len(varbind))
-        return envelope[0] + request_id + envelope[1] + varbind
+        return envelope[0] + data[at:tail] + envelope[1] + varbind
 
     def _enveloped(self, size: int) -> tuple[bytes, bytes]:
         """What stands before and behind the octets of the request id, before a varbind of this size."""

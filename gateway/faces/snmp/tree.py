@@ -48,7 +48,6 @@ class Slot:
         "_cell",
         "_device",
         "_kept",
-        "_row",
         "_seen",
         "_tag",
         "_varbind",
@@ -56,6 +55,7 @@ class Slot:
         "name",
         "object",
         "oid",
+        "row",
         "watched",
     )
 
@@ -65,7 +65,7 @@ class Slot:
         self.object = described
         self._tag = wire.TAGS[described.syntax]
         self._wraps = described.syntax in wire.WRAPPING
-        self._row = row
+        self.row = row
         device: Device | None = getattr(row, "device", None)
         self._device = device if described.changes is Changes.WITH_SNAPSHOT else None
         self._kept = described.changes is Changes.NEVER
@@ -90,7 +90,7 @@ class Slot:
         return self._varbind
 
     def _encode(self, now: float) -> None:
-        cell = self.object.get(self._row, now)
+        cell = self.object.get(self.row, now)
         if cell == self._cell:
             return
         self._cell = cell
@@ -179,20 +179,22 @@ class Tree(Window):
         self, gateway: Gateway, groups: Sequence[ScalarGroup], tables: Sequence[Table], single: Row | None = None
     ) -> None:
         """`single` is what the scalars are of, when not of the gateway."""
-        slots = [
-            Slot((*group.base, described.number, 0), described, gateway if single is None else single)
+        cells: list[tuple[Oid, ObjectType, Row]] = [
+            ((*group.base, described.number, 0), described, gateway if single is None else single)
             for group in groups
             for described in group.objects
         ]
         for table in tables:
             for index, row in _ROWS[table.rows](gateway):
-                slots += [
-                    Slot((*table.base, 1, column.number, *index), column, row)
+                cells += [
+                    ((*table.base, 1, column.number, *index), column, row)
                     for column in table.columns
                     if (column.models is None or _model(row) in column.models)
                     and (column.only is None or column.only(row))
                 ]
-        slots.sort(key=lambda slot: slot.oid)
+        cells.sort(key=lambda cell: cell[0])
+        # Made in the order of a walk, so that neighbours in it are neighbours in memory.
+        slots = [Slot(*cell) for cell in cells]
         objects = frozenset((*group.base, each.number) for group in groups for each in group.objects) | frozenset(
             (*table.base, 1, column.number) for table in tables for column in table.columns
         )

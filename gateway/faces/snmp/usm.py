@@ -113,13 +113,14 @@ class Cfb:
 class Mac:
     """HMAC with one key, its two halves begun once."""
 
-    __slots__ = ("_inner", "_outer", "size")
+    __slots__ = ("_inner", "_outer", "blank", "size")
 
     def __init__(self, auth: Auth, key: bytes) -> None:
         padded = key.ljust(auth.block_size, b"\0")
         self._inner = hashlib.new(auth.digest, bytes(octet ^ 0x36 for octet in padded))
         self._outer = hashlib.new(auth.digest, bytes(octet ^ 0x5C for octet in padded))
         self.size = auth.mac_size
+        self.blank = bytes(self.size)  # what stands in its place while it is made
 
     def of(self, message: bytes) -> bytes:
         """The authenticator of a message whose own authenticator is zeros."""

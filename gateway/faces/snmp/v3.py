@@ -27,7 +27,6 @@ OWN_MAX_SIZE = 1472
 _VERSION = wire.integer(0x02, VERSION_3)
 _GLOBAL_TAIL = wire.integer(0x02, USER_BASED)
 _FLAGS = [wire.tlv(0x04, bytes((flags,))) for flags in range(8)]
-_SIZE = wire.integer(0x02, OWN_MAX_SIZE)
 
 
 class Message:
@@ -129,15 +128,20 @@ def vector(boots: int, time: int, salt: bytes) -> bytes:
 class Sealer:
     """Makes messages of one user at one authoritative engine; `user` None: in clear, without a name.
 
-    What stands before the authenticator changes once a second and is kept.
+    What stands between the message id and the authenticator changes once a second and is kept.
     """
 
-    __slots__ = ("_authority", "_before", "_user")
+    __slots__ = ("_authority", "_before", "_heads", "_size", "_user", "_vector")
 
-    def __init__(self, user: LocalUser | None) -> None:
+    def __init__(self, user: LocalUser | None, max_size: int = OWN_MAX_SIZE) -> None:
         self._user = user
+        self._size = wire.integer(0x02, max_size)
+        fixed = len(self._size + _FLAGS[0] + _GLOBAL_TAIL)
+        # What stands before a message id of so many octets: 10 when its length takes five.
+        self._heads = [_VERSION + wire.head(0x30, size + fixed) for size in range(11)]
         self._authority: Authority | None = None
-        self._before = [b""] * 4
+        self._before = [b""] * 8  # by flags
+        self._vector = b""  # the first half of one
 
     def seal(self, authority: Authority, message_id: bytes, flags: int, body: bytes) -> bytes:
         """A whole message around the scoped PDU `body`, signed and encrypted as `flags` say.
@@ -146,38 +150,34 @@ class Sealer:
         """
         if authority is not self._authority:
             self._authority = authority
-            self._before = [self._security(authority, flags) for flags in range(4)]
+            self._before = [self._between(authority, flags) for flags in range(8)]
+            self._vector = vector(authority.boots, authority.time, b"")
         user = self._user
-        before = self._before[flags & (AUTH | PRIV)]
+        start = self._heads[len(message_id)] + message_id + self._before[flags]
         if user is None or not flags & AUTH:
-            return wire.tlv(0x30, _VERSION + _global(message_id, flags) + before + _EMPTY + _EMPTY + body)
-        after = _EMPTY
+            return wire.tlv(0x30, start + _EMPTY + _EMPTY + body)
         if flags & PRIV:
             salt = user.salt()
-            after = _SALT + salt
-            body = wire.tlv(0x04, user.cfb.encrypt(vector(authority.boots, authority.time, salt), body))
-        size = user.mac.size
-        start = _VERSION + _global(message_id, flags) + before + _SHORT_STRING[size]
-        message = wire.tlv(0x30, start + bytes(size) + after + body)
-        at = len(message) - len(body) - len(after) - size
-        return message[:at] + user.mac.of(message) + message[at + size :]
+            sealed = user.cfb.encrypt(self._vector + salt, body)
+            rest = _SALT + salt + wire.head(0x04, len(sealed)) + sealed
+        else:
+            rest = _EMPTY + body
+        mac = user.mac
+        start = wire.head(0x30, len(start) + mac.size + len(rest)) + start
+        return start + mac.of(start + mac.blank + rest) + rest
 
-    def _security(self, authority: Authority, flags: int) -> bytes:
-        """The security parameters up to the authenticator, of a message with these flags."""
-        name = self._user.name if self._user is not None and flags & AUTH else b""
-        mac = self._user.mac.size if self._user is not None and flags & AUTH else 0
-        salt = 8 if flags & PRIV else 0
+    def _between(self, authority: Authority, flags: int) -> bytes:
+        """What stands behind the message id, up to the octets of the authenticator if there is one."""
+        user = self._user if flags & AUTH else None
+        name, mac = (b"", 0) if user is None else (user.name, user.mac.size)
+        salt = 8 if user is not None and flags & PRIV else 0
         head = wire.tlv(0x04, authority.engine_id) + wire.integer(0x02, authority.boots)
         head += wire.integer(0x02, authority.time) + wire.tlv(0x04, name)
         inner = len(head) + 2 + mac + 2 + salt
         sequence = wire.head(0x30, inner)
-        return wire.head(0x04, len(sequence) + inner) + sequence + head
+        before = wire.head(0x04, len(sequence) + inner) + sequence + head
+        return self._size + _FLAGS[flags] + _GLOBAL_TAIL + before + (wire.head(0x04, mac) if mac else b"")
 
 
 _EMPTY = wire.tlv(0x04, b"")
 _SALT = wire.head(0x04, 8)
-_SHORT_STRING = [wire.head(0x04, size) for size in range(0x80)]
-
-
-def _global(message_id: bytes, flags: int) -> bytes:
-    return wire.tlv(0x30, message_id + _SIZE + _FLAGS[flags] + _GLOBAL_TAIL)

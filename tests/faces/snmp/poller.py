@@ -93,7 +93,7 @@ class Poller:
     def sealed(self, body: bytes, flags: int = AUTH_PRIV, engine_id: bytes | None = None) -> bytes:
         self.message_id += 1
         scoped = v3.scoped(self.authority.engine_id if engine_id is None else engine_id, self.context, body)
-        sealer = v3.Sealer(self.user if flags & v3.AUTH else None)
+        sealer = v3.Sealer(self.user if flags & v3.AUTH else None, self.max_size)
         return sealer.seal(self.authority, wire.integer(0x02, self.message_id), flags, scoped)
 
     def ask(self, kind: type, *names: Oid, bulk: tuple[int, int] = (0, 10)) -> Read | None:

@@ -89,8 +89,8 @@ def read(emc1: SnmpAgent, clock: StubClock) -> Read:
 
     def cell(number: int, unit: int = 11) -> object:
         slot = next(slot for slot in emc1._responder._contexts[context_of(unit)] if slot.oid == (*ROOT, number, 0))
-        assert (slot.varbind(clock.now) is None) == (slot.object.get(slot._row, clock.now) is None)
-        return slot.object.get(slot._row, clock.now)
+        assert (slot.varbind(clock.now) is None) == (slot.object.get(slot.row, clock.now) is None)
+        return slot.object.get(slot.row, clock.now)
 
     return cell
 
@@ -170,7 +170,7 @@ def test_every_value_has_its_form(read: Read, site: Site) -> None:
 def test_who_it_is(read: Read, emc1: SnmpAgent, site: Site, clock: StubClock) -> None:
     assert [read(number) for number in (1, 2, 3)] == [b"PS-MPPT-40M", b"16250001", b"v01.02.13"]
     values = {
-        slot.oid[len(SYSTEM)]: slot.object.get(slot._row, clock.now)
+        slot.oid[len(SYSTEM)]: slot.object.get(slot.row, clock.now)
         for slot in emc1._responder._contexts[b"11"]
         if slot.oid[: len(SYSTEM)] == SYSTEM
     }
@@ -185,7 +185,7 @@ def test_a_device_that_was_never_heard_still_tells_what_it_should_be(site: Site,
     device = site.by_unit[21]
     device.snapshot = Snapshot()
     tree = emc1_tree(any_gateway(site), device)
-    shown_now = {slot.oid: slot.object.get(slot._row, NOW) for slot in tree if slot.varbind(NOW) is not None}
+    shown_now = {slot.oid: slot.object.get(slot.row, NOW) for slot in tree if slot.varbind(NOW) is not None}
     assert {oid[len(ROOT)] for oid in shown_now if oid[: len(ROOT)] == ROOT} == {1, 2, 3}
     assert shown_now[*ROOT, 1, 0] == b"Morningstar ProStar MPPT"
     assert shown_now[*ROOT, 2, 0] == shown_now[*ROOT, 3, 0] == b""
@@ -196,7 +196,7 @@ def any_gateway(site: Site) -> Any:
     from gateway.faces.snmp.settings import SnmpSettings
 
     agent = SnmpAgent(SnmpSettings(listen=()), site, StubClock(), ModbusServerStats())
-    return next(iter(agent.tree))._row
+    return next(iter(agent.tree)).row
 
 
 @pytest.mark.parametrize("state", [DeviceState.STALE, DeviceState.OFFLINE, DeviceState.UNKNOWN])

@@ -35,8 +35,8 @@ def read(agent: SnmpAgent, clock: StubClock) -> Read:
         oid = (*base, column, index)
         slot = next((slot for slot in agent.tree if slot.oid == oid), None)
         assert slot is not None, "the agent has no such cell"
-        assert (slot.varbind(clock.now) is None) == (slot.object.get(slot._row, clock.now) is None)
-        return slot.object.get(slot._row, clock.now)
+        assert (slot.varbind(clock.now) is None) == (slot.object.get(slot.row, clock.now) is None)
+        return slot.object.get(slot.row, clock.now)
 
     return cell
 
@@ -174,7 +174,7 @@ def test_what_is_no_value_or_does_not_fit_is_not_said(read: Read, site: Site, va
 def test_another_device_moves_no_index(agent: SnmpAgent, site: Site, device_map: DeviceMap) -> None:
     added = Device("array-0", 5, 3, device_map)
     added.line = site.lines[0]
-    gateway = next(slot for slot in agent.tree)._row
+    gateway = next(slot for slot in agent.tree).row
     assert isinstance(gateway, Gateway)
     more = replace(gateway, site=Site.of("more", site.lines, [*site.devices, added]))
     before, after = ({row.index: row for row in entity.entities(each)} for each in (gateway, more))

@@ -70,7 +70,8 @@ def test_the_root_moves_everything() -> None:
 
 def test_long_names_use_short_words() -> None:
     assert object_name("battery_voltage") == "pgwBatteryVoltage"
-    assert object_name("compensation_temperature_maximum") == "pgwCompTempMax"
+    assert object_name("compensation_temperature_maximum") == "pgwCompensationTemperatureMax"
+    assert object_name("compensation_temperature_maximum_of_battery") == "pgwCompensationTempMaxOfBattery"
     with pytest.raises(MapError, match="shorter point name"):
         object_name("a_name_that_no_list_of_short_words_can_save")
 

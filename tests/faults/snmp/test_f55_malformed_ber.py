@@ -113,6 +113,7 @@ def test_hostile_datagrams_end_in_one_counter(spoken: SnmpAgent, caplog: pytest.
 @given(data=st.data())
 def test_no_octet_of_a_v3_message_can_be_changed(spoken: SnmpAgent, data: st.DataObject) -> None:
     poller = signed_in(spoken)
+    assert poller.ask(v2c.GetRequestPDU, SYS_DESCR) is not None  # from now on it is known
     message = bytearray(poller.sealed(pdu(v2c.GetRequestPDU, SYS_DESCR)))
     at = data.draw(st.integers(0, len(message) - 1))
     message[at] ^= data.draw(st.integers(1, 255))
