@@ -9,16 +9,28 @@ from __future__ import annotations
 from pathlib import Path
 
 from gateway.generate.dashboards import dashboard_outputs
+from gateway.generate.librenms import librenms_outputs
 from gateway.generate.metrics import metric_outputs
 from gateway.generate.mib import mib_outputs
 from gateway.generate.registers import register_outputs
 from gateway.generate.rules import rule_outputs
+from gateway.generate.snmp_exporter import exporter_outputs
+from gateway.generate.telegraf import telegraf_outputs
 
 
 def outputs() -> dict[str, str]:
     """Every derived file: path from the repository's root → text."""
     made: dict[str, str] = {}
-    for part in (mib_outputs(), register_outputs(), metric_outputs(), rule_outputs(), dashboard_outputs()):
+    for part in (
+        mib_outputs(),
+        register_outputs(),
+        metric_outputs(),
+        rule_outputs(),
+        dashboard_outputs(),
+        exporter_outputs(),
+        librenms_outputs(),
+        telegraf_outputs(),
+    ):
         for path, text in part.items():
             if path in made:
                 raise ValueError(f"{path} is made twice")

@@ -8,7 +8,7 @@
 # Exit 0: all are there. Exit 3: some are missing and may not be installed here (neither root nor
 # passwordless sudo, or no apt-get); they are named on stderr. Any other exit: apt-get failed.
 #
-# Debian starts and enables the services of prometheus, snmpd and ser2net when it installs them. The tests only
+# Debian starts and enables the services of prometheus, snmpd, ser2net and others when it installs them. The tests only
 # want the programs, and a second snmpd on a user's machine is a surprise. So starting is forbidden while
 # apt runs (a policy-rc.d, Debian Policy 9.3.3.1, removed again; one that is already there is left
 # alone), and units that came with this run are disabled afterwards. Services that were there before are
@@ -20,7 +20,10 @@ peers=(
   "mbpoll mbpoll"
   "snmp snmpwalk"
   "snmpd snmpd"
+  "snmptrapd snmptrapd"
   "prometheus prometheus"
+  "prometheus-snmp-exporter prometheus-snmp-exporter"
+  "python3-yaml /usr/lib/python3/dist-packages/yaml"
   "smitools smilint"
   "socat socat"
   "ser2net ser2net"
@@ -136,7 +139,7 @@ fi
 if [[ -d /run/systemd/system ]]; then
   for package in "${missing[@]}"; do
     case $package in
-      prometheus | snmpd | ser2net) "${root[@]}" systemctl disable --now --quiet "$package.service" || true ;;
+      prometheus | prometheus-snmp-exporter | snmpd | snmptrapd | ser2net) "${root[@]}" systemctl disable --now --quiet "$package.service" || true ;;
     esac
   done
 fi
