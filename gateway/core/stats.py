@@ -87,6 +87,7 @@ class DeviceHistoryStats:
     days: int | None = None  # stored; None: not known yet
     apart: int | None = None  # blocks kept apart, because their hourmeter cannot be
     harvested_at: float | None = None  # monotonic; None: never
+    waiting_since: float | None = None  # monotonic: a read of the log waits for idle line time; None: none waits
 
 
 @dataclass(slots=True)

@@ -41,6 +41,7 @@ def _lines(config: Config, budgets: Sequence[LineBudget]) -> Iterator[str]:
             yield (
                 f"{path}: polling would take {budget.use_ratio:.0%} of the line, so live values come every "
                 f"{budget.live_refresh_s:.1f} s; ask for them less often (poll.live_s) or use a second line"
+                + ("; the daily logs wait for idle time" if config.history.enabled else "")
             )
         if budget.live_refresh_s >= config.cache.max_age_s:
             yield (
