@@ -93,7 +93,7 @@ def bit_conditions(device_map: DeviceMap) -> Iterator[tuple[str, int, Condition]
 class Watch:
     """One condition of one subject: `device` or `line`, or the gateway where both are None."""
 
-    __slots__ = ("changed_at", "condition", "device", "known", "line", "state", "times")
+    __slots__ = ("changed_at", "condition", "device", "from_start", "known", "line", "state", "times")
 
     def __init__(self, condition: Condition, now: float, device: Device | None, line: LinePort | None) -> None:
         self.condition = condition
@@ -103,6 +103,7 @@ class Watch:
         self.known = ConditionState.UNKNOWN  # the last state that was not unknown
         self.changed_at = now
         self.times = 0  # raised since the start
+        self.from_start = False  # it holds since before the gateway first looked
 
     @property
     def unit_id(self) -> int:
@@ -151,6 +152,9 @@ class _Set:
             self._active[severity] += 1
             watch.times += watch.known is not ConditionState.RAISED
         if state is not ConditionState.UNKNOWN:
+            watch.from_start = state is ConditionState.RAISED and (
+                watch.from_start or watch.known is ConditionState.UNKNOWN
+            )
             watch.known = state
         watch.state = state
         watch.changed_at = now

@@ -79,6 +79,23 @@ class ModbusServerStats:
 
 
 @dataclass(slots=True)
+class NotifyStats:
+    """The SNMP notifications to one receiver since start."""
+
+    receiver: str  # address and port, as configured
+    kind: str  # "trap" or "inform"
+    notifications: int = 0
+    sent: int = 0  # datagrams with a notification; an inform may take several
+    repeated: int = 0  # of these, those that were sent before
+    acknowledged: int = 0
+    refused: Counter[str] = field(default_factory=Counter)  # reason → answers that say that the receiver takes it not
+    failures: int = 0  # datagrams that the system did not take
+    waiting: int = 0  # notifications that wait or are under way
+    acknowledged_at: float | None = None  # monotonic; None: never
+    silent: bool = False  # it leaves informs unanswered
+
+
+@dataclass(slots=True)
 class DeviceHistoryStats:
     """The daily log of one device: what is stored of the controller that is there now, and the harvests since start."""
 

@@ -63,9 +63,13 @@ class Gateway:
             history=history,
             log=None if history is None else HistorySource(kept.directory, config.site),
             clients=modbus.clients,
+            conditions=self.conditions,
+            notifications=snmp.notifier.stats,
         )
         harvesting = () if history is None else (HistoryKeeper(kept, self.site, clock, history),)
-        self.keepers: tuple[Runnable, ...] = (watching, *harvesting)
+        watching.told = snmp.notifier.changed
+        notifying = (snmp.notifier,) if snmp.notifier.stats else ()
+        self.keepers: tuple[Runnable, ...] = (watching, *harvesting, *notifying)
         if systemd is not None and systemd.watchdog_s is not None:
             self.keepers += (Watchdog(systemd, systemd.watchdog_s, self.stuck),)
         self.listeners: tuple[Listener, ...] = (*modbus.listeners, *snmp.listeners, *http.listeners)

@@ -13,9 +13,17 @@ from dataclasses import dataclass, field
 from gateway import __version__
 from gateway.clock import Clock
 from gateway.core.clients import Client
+from gateway.core.conditions import Conditions, DeviceConditions
 from gateway.core.site import Site
-from gateway.core.stats import HistoryStats, ModbusServerStats, TlsStats
+from gateway.core.stats import HistoryStats, ModbusServerStats, NotifyStats, TlsStats
 from gateway.faces.http.clients import CLIENT_RULES, client_sources
+from gateway.faces.http.conditions import (
+    DEVICE_CONDITION_RULES,
+    GATEWAY_CONDITION_RULES,
+    NOTIFY_RULES,
+    gateway_sources,
+    receiver_source,
+)
 from gateway.faces.http.devices import DEVICE_LABELS, device_labels
 from gateway.faces.http.history import DEVICE_HISTORY_RULES, STORE_RULES, DeviceHistoryView
 from gateway.faces.http.lines import DEVICE_RULES, LINE_LABELS, LINE_RULES, LineView
@@ -165,6 +173,9 @@ OWN_METRICS: tuple[MetricInfo, ...] = tuple(
         HTTP_RULES,
         STORE_RULES,
         DEVICE_HISTORY_RULES,
+        DEVICE_CONDITION_RULES,
+        GATEWAY_CONDITION_RULES,
+        NOTIFY_RULES,
     )
     for rule in rules
 )
@@ -189,6 +200,8 @@ class Counts:
     not_ready: Callable[[], Sequence[str]] = _no_reasons
     history: HistoryStats | None = None  # None: no history is kept
     clients: Iterable[Client] = ()
+    conditions: Conditions | None = None  # None: nobody watches them
+    notifications: Sequence[NotifyStats] = ()
 
 
 class OwnMetrics:
@@ -216,6 +229,18 @@ class OwnMetrics:
         if counts.history is not None:
             yield from families(STORE_RULES, [Source(counts.history)])
             yield from families(DEVICE_HISTORY_RULES, self._histories(counts.history, now))
+        if counts.conditions is not None:
+            yield from families(DEVICE_CONDITION_RULES, self._conditions(counts.conditions, now))
+            yield from families(GATEWAY_CONDITION_RULES, gateway_sources(counts.conditions))
+        yield from families(NOTIFY_RULES, [receiver_source(stats) for stats in counts.notifications])
+
+    def _conditions(self, conditions: Conditions, now: float) -> list[Source[DeviceConditions]]:
+        found = []
+        for device in self._devices:
+            of = conditions.devices[device.of.unit_id]
+            of.look(now)
+            found.append(Source(of, device.labels, device.written))
+        return found
 
     def _histories(self, history: HistoryStats, now: float) -> list[Source[DeviceHistoryView]]:
         return [

@@ -24,6 +24,7 @@ from gateway.faces.snmp.counters import SnmpCounters
 from gateway.faces.snmp.emc1 import context_of, emc1_tree
 from gateway.faces.snmp.engine import Engine, EngineLost, start_engine
 from gateway.faces.snmp.layout import Layout, shipped_layout
+from gateway.faces.snmp.notifier import Notifier
 from gateway.faces.snmp.objects import Gateway
 from gateway.faces.snmp.responder import DATAGRAM_LIMIT, Refused, Responder
 from gateway.faces.snmp.security import Security
@@ -73,6 +74,7 @@ class SnmpAgent:
                 (self.layout.module, "PROSTAR-GATEWAY-MIB: gateway, lines and solar charge controllers"),
                 *entity.CAPABILITIES,
             ),
+            authentication_traps=settings.authentication_traps,
             conditions=conditions if conditions is not None else Conditions(site, (), clock.monotonic()),
         )
         groups = (*standard.GROUPS, entity.GENERAL)
@@ -83,6 +85,11 @@ class SnmpAgent:
         self._trees = tuple(contexts.values())
         self._responder = Responder(settings, contexts, self.counters)
         self._throttle = Throttle()
+        self.notifier = Notifier(
+            settings.receivers, self.layout, site=site.name, clock=clock, engine=self.engine, ticks=described.ticks
+        )
+        if settings.authentication_traps:
+            self._responder.on_authentication_failure = self.notifier.authentication_failed
         self.listeners = (
             *(SnmpListener(self, host, port) for host, port in settings.listen),
             *(
