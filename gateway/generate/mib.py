@@ -13,9 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from gateway.errors import MapError
-from gateway.faces.snmp import notifications
 from gateway.faces.snmp.layout import Layout, shipped_layout
-from gateway.faces.snmp.notifications import NotificationType
 from gateway.faces.snmp.objects import Convention, Index, ObjectType, ScalarGroup, Syntax, Table
 from gateway.faces.snmp.settings import DEFAULT_ROOT, Oid
 
@@ -25,7 +23,7 @@ MIB = "PROSTAR-GATEWAY-MIB"
 LOCK = "mibs/oids.lock"
 
 REVISIONS: tuple[tuple[str, str], ...] = (
-    ("202611220000Z", "First version: gateway, lines, devices and their values, conditions, notifications."),
+    ("202611220000Z", "First version: gateway, lines, devices and their values."),
 )
 """When the modules changed and how, newest first; a change of the lock needs a new entry."""
 
@@ -52,9 +50,8 @@ PgwText ::= TEXTUAL-CONVENTION
 """
 
 _PARENTS = """\
-pgwNotifications OBJECT IDENTIFIER ::= { pgwMIB 0 }
-pgwObjects       OBJECT IDENTIFIER ::= { pgwMIB 1 }
-pgwConformance   OBJECT IDENTIFIER ::= { pgwMIB 2 }
+pgwObjects     OBJECT IDENTIFIER ::= { pgwMIB 1 }
+pgwConformance OBJECT IDENTIFIER ::= { pgwMIB 2 }
 """
 
 _LOCK_HEAD = """\
@@ -110,11 +107,9 @@ def lock(described: Layout, published: str) -> str:
 
 
 def _lock_lines(described: Layout) -> Iterator[str]:
-    for group in (*described.groups, described.notify):
+    for group in described.groups:
         for each in group.objects:
             yield _lock_line((*group.base, each.number, 0), each)
-    for kind in notifications.TYPES:
-        yield f"{_dotted((*described.notifications, kind.number))} {kind.name} {','.join(notifications.OBJECTS)}"
     for table in described.tables:
         for each in table.columns:
             yield _lock_line((*table.base, 1, each.number), each)
@@ -190,12 +185,11 @@ def _convention(convention: Convention) -> str:
 def _objects(described: Layout) -> str:
     everything = [*(each for group in described.groups for each in group.objects)]
     everything += [each for table in described.tables for each in table.columns]
-    everything += described.notify.objects
     used = {each.syntax.value for each in everything if not each.convention} - {Syntax.TEXT, Syntax.TIME_STAMP}
     imports = {
-        "SNMPv2-SMI": ("MODULE-IDENTITY", "OBJECT-TYPE", "NOTIFICATION-TYPE", *sorted({*used, "Unsigned32"})),
+        "SNMPv2-SMI": ("MODULE-IDENTITY", "OBJECT-TYPE", *sorted({*used, "Unsigned32"})),
         "SNMPv2-TC": ("TimeStamp",),
-        "SNMPv2-CONF": ("MODULE-COMPLIANCE", "OBJECT-GROUP", "NOTIFICATION-GROUP"),
+        "SNMPv2-CONF": ("MODULE-COMPLIANCE", "OBJECT-GROUP"),
         REG: ("pgwModules",),
         TC: ("PgwText", *(convention.name for convention in described.conventions)),
     }
@@ -203,37 +197,24 @@ def _objects(described: Layout) -> str:
         _identity("pgwMIB", "ProStar solar charge controllers behind prostar-gateway. Read-only.", "pgwModules 2"),
         _PARENTS,
     ]
-    notify = described.notify
-    members: list[tuple[int, ScalarGroup | Table]] = [(each.number, each) for each in (*described.groups, notify)]
+    members: list[tuple[int, ScalarGroup | Table]] = [(each.number, each) for each in described.groups]
     members += [(each.number, each) for each in described.tables]
     groups: list[tuple[int, str, str, Sequence[ObjectType]]] = []
     for number, member in sorted(members, key=lambda pair: pair[0]):
         if isinstance(member, ScalarGroup):
-            parts += _scalars(member, "accessible-for-notify" if member is notify else "read-only")
+            parts += _scalars(member)
             groups.append((number, f"{member.name}Group", member.description, member.objects))
         else:
             parts += _table(member)
             groups.append((number, f"{member.name}Group", member.description, member.columns))
-    parts += [_notification(kind) for kind in notifications.TYPES]
     parts += _conformance(groups)
     return _module(MIB, imports, parts)
 
 
-def _notification(kind: NotificationType) -> str:
-    listed = ",\n".join(f"        {name}" for name in notifications.OBJECTS)
-    return (
-        f"{kind.name} NOTIFICATION-TYPE\n"
-        f"    OBJECTS {{\n{listed}\n    }}\n"
-        "    STATUS      current\n"
-        f"    DESCRIPTION\n{_text(kind.description)}\n"
-        f"    ::= {{ pgwNotifications {kind.number} }}\n"
-    )
-
-
-def _scalars(group: ScalarGroup, access: str) -> Iterator[str]:
+def _scalars(group: ScalarGroup) -> Iterator[str]:
     yield f"-- {group.description}\n\n{group.name} OBJECT IDENTIFIER ::= {{ pgwObjects {group.number} }}\n"
     for each in group.objects:
-        yield _object(each, group.name, access)
+        yield _object(each, group.name)
 
 
 def _table(table: Table) -> Iterator[str]:
@@ -277,13 +258,13 @@ def _table(table: Table) -> Iterator[str]:
         yield _object(each, entry)
 
 
-def _object(each: ObjectType, parent: str, access: str = "read-only") -> str:
+def _object(each: ObjectType, parent: str) -> str:
     units = f'    UNITS       "{_ascii(each.units)}"\n' if each.units else ""
     return (
         f"{each.name} OBJECT-TYPE\n"
         f"    SYNTAX      {_syntax(each)}\n"
         f"{units}"
-        f"    MAX-ACCESS  {access}\n"
+        "    MAX-ACCESS  read-only\n"
         "    STATUS      current\n"
         f"    DESCRIPTION\n{_text(each.description)}\n"
         f"    ::= {{ {parent} {each.number} }}\n"
@@ -304,15 +285,7 @@ def _conformance(groups: Sequence[tuple[int, str, str, Sequence[ObjectType]]]) -
             f"    DESCRIPTION\n{_text(about)}\n"
             f"    ::= {{ pgwGroups {number} }}\n"
         )
-    listed = ",\n".join(f"        {kind.name}" for kind in notifications.TYPES)
-    yield (
-        "pgwNotificationGroup NOTIFICATION-GROUP\n"
-        f"    NOTIFICATIONS {{\n{listed}\n    }}\n"
-        "    STATUS      current\n"
-        f"    DESCRIPTION\n{_text('What receivers are told.')}\n"
-        "    ::= { pgwGroups 1000 }\n"
-    )
-    mandatory = ",\n".join(f"        {name}" for name in (*(name for _, name, _, _ in groups), "pgwNotificationGroup"))
+    mandatory = ",\n".join(f"        {name}" for _, name, _, _ in groups)
     yield (
         "pgwCompliance MODULE-COMPLIANCE\n"
         "    STATUS      current\n"
