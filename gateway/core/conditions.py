@@ -93,7 +93,7 @@ def bit_conditions(device_map: DeviceMap) -> Iterator[tuple[str, int, Condition]
 class Watch:
     """One condition of one subject: `device` or `line`, or the gateway where both are None."""
 
-    __slots__ = ("changed_at", "condition", "device", "known", "line", "state", "times")
+    __slots__ = ("changed_at", "condition", "device", "from_start", "known", "line", "state", "times")
 
     def __init__(self, condition: Condition, now: float, device: Device | None, line: LinePort | None) -> None:
         self.condition = condition
@@ -103,6 +103,7 @@ class Watch:
         self.known = ConditionState.UNKNOWN  # the last state that was not unknown
         self.changed_at = now
         self.times = 0  # raised since the start
+        self.from_start = False  # it holds since before the gateway first looked
 
     @property
     def unit_id(self) -> int:
@@ -151,6 +152,9 @@ class _Set:
             self._active[severity] += 1
             watch.times += watch.known is not ConditionState.RAISED
         if state is not ConditionState.UNKNOWN:
+            watch.from_start = state is ConditionState.RAISED and (
+                watch.from_start or watch.known is ConditionState.UNKNOWN
+            )
             watch.known = state
         watch.state = state
         watch.changed_at = now
@@ -249,16 +253,6 @@ class GatewayConditions(_Set):
             self._add(line_condition(line.index), now, line=line)
         self._raised_since: dict[int, float] = {}
 
-    def go_on(self, before: GatewayConditions) -> None:
-        """Take over what is known of the same conditions: of the gateway itself, and of lines that stayed."""
-        self._raised_since = before._raised_since
-        for code, watch in before.by_code.items():
-            mine = self.by_code.get(code)
-            if mine is not None and mine.line is watch.line:
-                self.by_code[code] = watch
-                if watch.state is ConditionState.RAISED:
-                    self._active[watch.condition.severity] += 1
-
     def line_is(self, index: int, state: LineState, since: float, now: float) -> None:
         """Learn the state of a line, and since when it has it."""
         down_long = state is LineState.DOWN and now - since >= DOWN_S
@@ -285,19 +279,12 @@ class GatewayConditions(_Set):
 class Conditions:
     """All conditions of a site; `own` are those of the gateway itself, which are told by `gateway.tell`."""
 
-    def __init__(self, site: Site, own: Sequence[Condition], now: float, before: Conditions | None = None) -> None:
-        """With those of `before`, as far as their devices and lines are still there."""
-        self._changed: dict[Watch, None] = {} if before is None else before._changed  # noqa: SLF001 - its own kind
+    def __init__(self, site: Site, own: Sequence[Condition], now: float) -> None:
+        self._changed: dict[Watch, None] = {}
         self._lines = site.lines
         self.gateway = GatewayConditions(site.lines, own, now, self._changed)
-        known = {} if before is None else before.devices
-        if before is not None:
-            self.gateway.go_on(before.gateway)
         self.devices: Mapping[int, DeviceConditions] = {
-            device.unit_id: known[device.unit_id]
-            if device.unit_id in known and known[device.unit_id].device is device
-            else DeviceConditions(device, now, self._changed)
-            for device in site.devices
+            device.unit_id: DeviceConditions(device, now, self._changed) for device in site.devices
         }
 
     def look(self, now: float) -> None:

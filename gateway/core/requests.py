@@ -9,6 +9,7 @@ Rule 3: a write has one waiter and is made once.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
@@ -159,6 +160,7 @@ class PollItem:
     due: float
     misses: int = 0  # attempts in a row that gave no data
     fresh: bool = False  # whether it gave data since the line was opened or the device came back
+    early_at: float = -math.inf  # when it was last brought forward
 
     @property
     def optional(self) -> bool:

@@ -8,7 +8,9 @@ Rule 3: of the polls, the one that was due first goes first; after its turn it i
         started, so that on a line too slow for its polls all periods stretch alike, and a pause (suspend, a line
         that was down) is followed by one round, not by a burst.
 Rule 4: a quarantined device has one poll, its probe, when its breaker says so.
-Rule 5: background reads go only when they are over before the next poll is due (or by rule 2).
+Rule 5: background reads go only when nothing else is to be done and they are over before the next poll is due, however
+        long they wait. So that idle time which lies in pieces between the polls is of use, a background read that has
+        waited for GATHER_S brings polls forward, each at most once in GATHER_S: then they follow one another.
 Rule 6: client reads share the line fairly (fairness.py) and are joined where that saves line time (coalescing.py).
 """
 
@@ -17,6 +19,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from operator import itemgetter
 
 from gateway.core.coalescing import Cost, join
 from gateway.core.fairness import FairQueue
@@ -28,7 +31,8 @@ from gateway.devices.plan import limit as protocol_limit
 from gateway.errors import QueueFull
 from gateway.modbus.pdu import ReadRequest
 
-PATIENCE_S = {Lane.SLAVE_CONTROL: 0.0, Lane.WRITE: 0.5, Lane.CLIENT: 1.0, Lane.BACKGROUND: 30.0}
+PATIENCE_S = {Lane.SLAVE_CONTROL: 0.0, Lane.WRITE: 0.5, Lane.CLIENT: 1.0}
+GATHER_S = 30.0
 SLAVE_TURNS = 4
 """How often slave control may go ahead of a lane that has waited too long."""
 
@@ -77,12 +81,6 @@ class Scheduler:
     def __len__(self) -> int:
         return len(self._clients) + len(self._background) + sum(map(len, self._writes.values()))
 
-    def adjust(self, *, limit: int, limit_s: float) -> None:
-        """Other limits from now on."""
-        self._limit = limit
-        self._clients.adjust(limit=limit, limit_s=limit_s)
-        self._background.adjust(limit=limit, limit_s=float("inf"))
-
     def add_read(self, device: Device, pdu: bytes, span: Span | None, waiter: Waiter, lane: Lane) -> ClientRead | None:
         """Queue a read; see FairQueue.add."""
         return self._queue(lane).add(device, pdu, span, waiter)
@@ -126,11 +124,12 @@ class Scheduler:
             return now
         due = self._next_poll_due()
         background = self._background.head()
-        if background is not None:
-            fits_at = now if due is None or now + self._read_s(background) <= due else due
-            aged_at = max(background.queued_at, self._served_at[Lane.BACKGROUND]) + PATIENCE_S[Lane.BACKGROUND]
-            return min(fits_at, max(aged_at, now))
-        return due
+        if background is None or (due is not None and due <= now):
+            return due
+        if self._fits(background, now) or self._early(background, now) is not None:
+            return now
+        gather_at = self._gather_at(background)
+        return due if due is None or gather_at <= now else min(due, gather_at)
 
     def next(self, now: float) -> Turn | None:
         """Take the turn whose time it is at `now`, or None."""
@@ -145,14 +144,8 @@ class Scheduler:
         poll = self._due_poll(now)
         if poll is not None:
             ready[Lane.POLL] = poll[0]
-        background = self._background.head()
-        if background is not None:
-            due = self._next_poll_due()
-            aged_at = max(background.queued_at, self._served_at[Lane.BACKGROUND]) + PATIENCE_S[Lane.BACKGROUND]
-            if aged_at <= now or due is None or now + self._read_s(background) <= due:
-                ready[Lane.BACKGROUND] = aged_at
         if not ready:
-            return None
+            return self._when_idle(now)
         lane = self._choose(ready, now, poll_grace_s=(poll[1].period_s or 0.0) if poll is not None else 0.0)
         self._served_at[lane] = now
         if lane in self._writes:
@@ -160,9 +153,21 @@ class Scheduler:
         if lane is Lane.POLL:
             assert poll is not None
             return poll[1]
-        head = client if lane is Lane.CLIENT else background
-        assert head is not None
-        return self._join(head)
+        assert client is not None
+        return self._join(client)
+
+    def _when_idle(self, now: float) -> Turn | None:
+        """Rule 5."""
+        background = self._background.head()
+        if background is None:
+            return None
+        if self._fits(background, now):
+            self._served_at[Lane.BACKGROUND] = now
+            return self._join(background)
+        early = self._early(background, now)
+        if early is not None:
+            early.early_at = now
+        return early
 
     def _choose(self, ready: dict[Lane, float], now: float, *, poll_grace_s: float) -> Lane:
         """Rules 1 and 2."""
@@ -202,6 +207,25 @@ class Scheduler:
 
     def _read_s(self, read: ClientRead) -> float:
         return self._cost(Space.REGISTERS, 3) if read.span is None else self._cost(read.span.space, read.span.count)
+
+    def _fits(self, background: ClientRead, now: float) -> bool:
+        due = self._next_poll_due()
+        return due is None or now + self._read_s(background) <= due
+
+    def _gather_at(self, background: ClientRead) -> float:
+        return max(background.queued_at, self._served_at[Lane.BACKGROUND]) + GATHER_S
+
+    def _early(self, background: ClientRead, now: float) -> PollItem | None:
+        """The poll to bring forward for a background read that does not fit (rule 5)."""
+        if now < self._gather_at(background):
+            return None
+        firsts = [polls.first() for polls in self._polls.values() if polls.breaker.probe_at is None]
+        in_the_way = [
+            (due, item)
+            for due, item in (first for first in firsts if first is not None)
+            if due < now + self._read_s(background) and item.period_s is not None and item.early_at + GATHER_S <= now
+        ]
+        return min(in_the_way, key=itemgetter(0))[1] if in_the_way else None
 
     def _next_poll_due(self) -> float | None:
         return min((first[0] for polls in self._polls.values() if (first := polls.first()) is not None), default=None)

@@ -79,13 +79,20 @@ class ModbusServerStats:
 
 
 @dataclass(slots=True)
-class ServiceStats:
-    """The process since start."""
+class NotifyStats:
+    """The SNMP notifications to one receiver since start."""
 
-    reloads: Counter[str] = field(default_factory=Counter)  # what became of it → count
-    reload_works: bool = True  # whether the file was right when it was last read
-    configured_at: float = 0.0  # wall time at which the configuration in use was taken
-    restarts: Counter[str] = field(default_factory=Counter)  # task → how often a bug ended it
+    receiver: str  # address and port, as configured
+    kind: str  # "trap" or "inform"
+    notifications: int = 0
+    sent: int = 0  # datagrams with a notification; an inform may take several
+    repeated: int = 0  # of these, those that were sent before
+    acknowledged: int = 0
+    refused: Counter[str] = field(default_factory=Counter)  # reason → answers that say that the receiver takes it not
+    failures: int = 0  # datagrams that the system did not take
+    waiting: int = 0  # notifications that wait or are under way
+    acknowledged_at: float | None = None  # monotonic; None: never
+    silent: bool = False  # it leaves informs unanswered
 
 
 @dataclass(slots=True)
@@ -97,6 +104,7 @@ class DeviceHistoryStats:
     days: int | None = None  # stored; None: not known yet
     apart: int | None = None  # blocks kept apart, because their hourmeter cannot be
     harvested_at: float | None = None  # monotonic; None: never
+    waiting_since: float | None = None  # monotonic: a read of the log waits for idle line time; None: none waits
 
 
 @dataclass(slots=True)

@@ -13,7 +13,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from gateway.errors import MapError
+from gateway.faces.snmp import notifications
 from gateway.faces.snmp.layout import Layout, shipped_layout
+from gateway.faces.snmp.notifications import NotificationType
 from gateway.faces.snmp.objects import Convention, Index, ObjectType, ScalarGroup, Syntax, Table
 from gateway.faces.snmp.settings import DEFAULT_ROOT, Oid
 
@@ -23,7 +25,7 @@ MIB = "PROSTAR-GATEWAY-MIB"
 LOCK = "mibs/oids.lock"
 
 REVISIONS: tuple[tuple[str, str], ...] = (
-    ("202611220000Z", "First version: gateway, lines, devices and their values."),
+    ("202611220000Z", "First version: gateway, lines, devices and their values, conditions, notifications."),
 )
 """When the modules changed and how, newest first; a change of the lock needs a new entry."""
 
@@ -50,8 +52,9 @@ PgwText ::= TEXTUAL-CONVENTION
 """
 
 _PARENTS = """\
-pgwObjects     OBJECT IDENTIFIER ::= { pgwMIB 1 }
-pgwConformance OBJECT IDENTIFIER ::= { pgwMIB 2 }
+pgwNotifications OBJECT IDENTIFIER ::= { pgwMIB 0 }
+pgwObjects       OBJECT IDENTIFIER ::= { pgwMIB 1 }
+pgwConformance   OBJECT IDENTIFIER ::= { pgwMIB 2 }
 """
 
 _LOCK_HEAD = """\
@@ -107,9 +110,11 @@ def lock(described: Layout, published: str) -> str:
 
 
 def _lock_lines(described: Layout) -> Iterator[str]:
-    for group in described.groups:
+    for group in (*described.groups, described.notify):
         for each in group.objects:
             yield _lock_line((*group.base, each.number, 0), each)
+    for kind in notifications.TYPES:
+        yield f"{_dotted((*described.notifications, kind.number))} {kind.name} {','.join(notifications.OBJECTS)}"
     for table in described.tables:
         for each in table.columns:
             yield _lock_line((*table.base, 1, each.number), each)
@@ -185,11 +190,12 @@ def _convention(convention: Convention) -> str:
 def _objects(described: Layout) -> str:
     everything = [*(each for group in described.groups for each in group.objects)]
     everything += [each for table in described.tables for each in table.columns]
+    everything += described.notify.objects
     used = {each.syntax.value for each in everything if not each.convention} - {Syntax.TEXT, Syntax.TIME_STAMP}
     imports = {
-        "SNMPv2-SMI": ("MODULE-IDENTITY", "OBJECT-TYPE", *sorted({*used, "Unsigned32"})),
+        "SNMPv2-SMI": ("MODULE-IDENTITY", "OBJECT-TYPE", "NOTIFICATION-TYPE", *sorted({*used, "Unsigned32"})),
         "SNMPv2-TC": ("TimeStamp",),
-        "SNMPv2-CONF": ("MODULE-COMPLIANCE", "OBJECT-GROUP"),
+        "SNMPv2-CONF": ("MODULE-COMPLIANCE", "OBJECT-GROUP", "NOTIFICATION-GROUP"),
         REG: ("pgwModules",),
         TC: ("PgwText", *(convention.name for convention in described.conventions)),
     }
@@ -197,24 +203,37 @@ def _objects(described: Layout) -> str:
         _identity("pgwMIB", "ProStar solar charge controllers behind prostar-gateway. Read-only.", "pgwModules 2"),
         _PARENTS,
     ]
-    members: list[tuple[int, ScalarGroup | Table]] = [(each.number, each) for each in described.groups]
+    notify = described.notify
+    members: list[tuple[int, ScalarGroup | Table]] = [(each.number, each) for each in (*described.groups, notify)]
     members += [(each.number, each) for each in described.tables]
     groups: list[tuple[int, str, str, Sequence[ObjectType]]] = []
     for number, member in sorted(members, key=lambda pair: pair[0]):
         if isinstance(member, ScalarGroup):
-            parts += _scalars(member)
+            parts += _scalars(member, "accessible-for-notify" if member is notify else "read-only")
             groups.append((number, f"{member.name}Group", member.description, member.objects))
         else:
             parts += _table(member)
             groups.append((number, f"{member.name}Group", member.description, member.columns))
+    parts += [_notification(kind) for kind in notifications.TYPES]
     parts += _conformance(groups)
     return _module(MIB, imports, parts)
 
 
-def _scalars(group: ScalarGroup) -> Iterator[str]:
+def _notification(kind: NotificationType) -> str:
+    listed = ",\n".join(f"        {name}" for name in notifications.OBJECTS)
+    return (
+        f"{kind.name} NOTIFICATION-TYPE\n"
+        f"    OBJECTS {{\n{listed}\n    }}\n"
+        "    STATUS      current\n"
+        f"    DESCRIPTION\n{_text(kind.description)}\n"
+        f"    ::= {{ pgwNotifications {kind.number} }}\n"
+    )
+
+
+def _scalars(group: ScalarGroup, access: str) -> Iterator[str]:
     yield f"-- {group.description}\n\n{group.name} OBJECT IDENTIFIER ::= {{ pgwObjects {group.number} }}\n"
     for each in group.objects:
-        yield _object(each, group.name)
+        yield _object(each, group.name, access)
 
 
 def _table(table: Table) -> Iterator[str]:
@@ -258,13 +277,13 @@ def _table(table: Table) -> Iterator[str]:
         yield _object(each, entry)
 
 
-def _object(each: ObjectType, parent: str) -> str:
+def _object(each: ObjectType, parent: str, access: str = "read-only") -> str:
     units = f'    UNITS       "{_ascii(each.units)}"\n' if each.units else ""
     return (
         f"{each.name} OBJECT-TYPE\n"
         f"    SYNTAX      {_syntax(each)}\n"
         f"{units}"
-        "    MAX-ACCESS  read-only\n"
+        f"    MAX-ACCESS  {access}\n"
         "    STATUS      current\n"
         f"    DESCRIPTION\n{_text(each.description)}\n"
         f"    ::= {{ {parent} {each.number} }}\n"
@@ -285,7 +304,15 @@ def _conformance(groups: Sequence[tuple[int, str, str, Sequence[ObjectType]]]) -
             f"    DESCRIPTION\n{_text(about)}\n"
             f"    ::= {{ pgwGroups {number} }}\n"
         )
-    mandatory = ",\n".join(f"        {name}" for _, name, _, _ in groups)
+    listed = ",\n".join(f"        {kind.name}" for kind in notifications.TYPES)
+    yield (
+        "pgwNotificationGroup NOTIFICATION-GROUP\n"
+        f"    NOTIFICATIONS {{\n{listed}\n    }}\n"
+        "    STATUS      current\n"
+        f"    DESCRIPTION\n{_text('What receivers are told.')}\n"
+        "    ::= { pgwGroups 1000 }\n"
+    )
+    mandatory = ",\n".join(f"        {name}" for name in (*(name for _, name, _, _ in groups), "pgwNotificationGroup"))
     yield (
         "pgwCompliance MODULE-COMPLIANCE\n"
         "    STATUS      current\n"

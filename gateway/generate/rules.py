@@ -195,7 +195,16 @@ LINE_ALERTS: tuple[Alert, ...] = (
         "1h",
         "warning",
         f"The daily log of {_AT} was last read {{{{ $value | humanizeDuration }}}} ago",
-        "The controller answers, but its log does not get read to the end: the line may have no idle time.",
+        "The controller answers, but its log does not get read to the end: see prostar_gateway_history_failures_total.",
+    ),
+    Alert(
+        "ProstarHistoryWaits",
+        "prostar_gateway_history_wait_seconds > 86400",
+        "5m",
+        "warning",
+        f"The daily log of {_AT} has been waiting {{{{ $value | humanizeDuration }}}} for idle time on its line",
+        "The log is never read ahead of a poll or a client, so on a line without idle time it is not read at all; the "
+        "controller keeps 256 days. Poll less often (poll.live_s, or poll.night_s for the nights).",
     ),
 )
 

@@ -12,6 +12,8 @@ Rule 4: a harvest that was interrupted goes on with the blocks it has: one of th
 Rule 5: a block behind the newest day whose hourmeter cannot be is left to the reading of a whole ring (ring.py);
         `odd` says that one was seen. A wrong hourmeter in the past looks like the end; so whoever misses a day that
         must have been written reads the whole ring (keeper.py).
+Rule 6: when the line has no idle time as long as a read, the harvest goes on with reads of half as many blocks, down to
+        one; the next harvest tries long ones again.
 """
 
 from __future__ import annotations
@@ -77,6 +79,7 @@ class Harvest:
         self.ready_at = 0.0  # not before
         self.stage_anew = not staged  # what is staged elsewhere is of no use
         self._fails = 0
+        self._shorter = 0
         self._todo: list[int] = []
         self._staged = dict(staged or {})
         self._proof: tuple[int, bytes] | None = None
@@ -92,7 +95,7 @@ class Harvest:
         """The next read, to be made at `ready_at`; None when it is over."""
         if self.outcome is not None:
             return None
-        most = max(1, self.most >> (self._fails // 2))
+        most = max(1, self.most >> (self._shorter + self._fails // 2))
         first = self._todo[0]
         count = 1
         while count < min(most, len(self._todo)) and self._todo[count] == first + count:
@@ -138,6 +141,10 @@ class Harvest:
         read = self.next_read()
         if read is not None and read.count == 1 and self._fails >= TRIES + 2 * (self.most.bit_length() - 1):
             self._pass_over()
+
+    def crowded(self) -> None:
+        """A read found no idle time that was long enough (rule 6)."""
+        self._shorter += 1
 
     def _refused(self, read: BlockRead) -> None:
         if read.count > 1:

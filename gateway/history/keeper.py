@@ -1,6 +1,8 @@
 """The asyncio shell of the history: makes the reads that harvest.py wants, in idle line time, and stores the days.
 
-Rule 1: reads go out in the background lane, one at a time on a line; clients and live polls come first.
+Rule 1: reads go out in the background lane, one at a time on a line; clients and polls come first, always. A read that
+        found no idle time for CROWDED_S is made shorter (harvest.py); one of a single block waits, however long that
+        takes, and is told about once an hour.
 Rule 2: only an online device is asked: its identity is proved and its hourmeter is known.
 Rule 3: what cannot be stored disturbs nobody (async_store.py); no line is asked for it meanwhile.
 Rule 4: when the gateway's clock is set, the dates that were made by the wrong one are moved along. (Time in which the
@@ -37,6 +39,9 @@ from gateway.history.store import Kept, Plan, Store
 CLIENT = "history"
 CHECK_S = 2.0
 CLOCK_STEP_S = 60.0
+CROWDED_S = 60.0
+LONG_S = 600.0
+"""A read that has waited so long for idle time is worth a line of the log."""
 
 _AWAY = (DeviceOffline, PathUnavailable, ShuttingDown)
 _log = logging.getLogger(__name__)
@@ -176,7 +181,10 @@ class HistoryKeeper:
             wait_s = harvest.ready_at - self._clock.monotonic()
             if wait_s > 0:
                 await self._sleep(wait_s)
-            outcome = await _ask(watch.device, read.pdu(watch.device.map, watch.layout))
+            outcome = await self._ask(watch, read.pdu(watch.device.map, watch.layout), patient=read.count == 1)
+            if outcome is None:
+                harvest.crowded()
+                continue
             if isinstance(outcome, _AWAY):
                 raise _Interrupted(outcome.label)
             if isinstance(outcome, RequestError):
@@ -207,6 +215,54 @@ class HistoryKeeper:
         result = _Result(kept, later, ending, whole=not harvest.unread)
         self._harvested(watch, result, began)
         return result
+
+    async def _ask(self, watch: _Watch, pdu: bytes, *, patient: bool) -> Outcome | None:
+        """One background read, however long it waits for idle time; None after CROWDED_S, unless `patient`.
+
+        Its ticket is given back when nobody waits any more.
+        """
+        answer: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
+
+        def done(outcome: Outcome) -> None:
+            if not answer.done():
+                answer.set_result(outcome)
+
+        stats = watch.stats
+        asked_at = self._clock.monotonic()
+        if stats.waiting_since is None:
+            stats.waiting_since = asked_at
+        ticket = watch.device.line.read(watch.device, pdu, done, client=CLIENT, background=True)
+        try:
+            while not answer.done():
+                crowded = asyncio.ensure_future(self._sleep(CROWDED_S))
+                try:
+                    await asyncio.wait((answer, crowded), return_when=asyncio.FIRST_COMPLETED)
+                finally:
+                    crowded.cancel()
+                now = self._clock.monotonic()
+                if answer.done() or now - asked_at < CROWDED_S:
+                    continue
+                self._waits(watch, now - stats.waiting_since)
+                if not patient:
+                    return None
+            stats.waiting_since = None
+            return answer.result()
+        except asyncio.CancelledError:
+            stats.waiting_since = None
+            raise
+        finally:
+            ticket.cancel()
+
+    def _waits(self, watch: _Watch, waited_s: float) -> None:
+        if waited_s < LONG_S:
+            return
+        line, device = watch.device.line.name, watch.device.name
+        left_out = self._budget.spend((device, "waits"), self._clock.monotonic())
+        if left_out is not None:
+            _log.warning(
+                'event=history_waits_for_line line="%s" device="%s" waited_s=%.0f left_out=%d',
+                line, device, waited_s, left_out,
+            )  # fmt: skip
 
     def _misses_a_day(self, watch: _Watch, result: _Result) -> bool:
         """Rule 5."""
@@ -283,21 +339,6 @@ class HistoryKeeper:
         moved = await self._store.call(Store.shift, keys, step_s)
         self._clock_offset = offset
         _log.warning("event=history_clock_set step_s=%.0f days_moved=%d", step_s, moved)
-
-
-async def _ask(device: Device, pdu: bytes) -> Outcome:
-    """One background read; its ticket is given back when nobody waits any more."""
-    answer: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
-
-    def done(outcome: Outcome) -> None:
-        if not answer.done():
-            answer.set_result(outcome)
-
-    ticket = device.line.read(device, pdu, done, client=CLIENT, background=True)
-    try:
-        return await answer
-    finally:
-        ticket.cancel()
 
 
 def _who(seen: Seen) -> Who:

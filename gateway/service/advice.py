@@ -12,6 +12,7 @@ from pathlib import Path
 
 from gateway.clock import SystemClock
 from gateway.core.budget import LineBudget
+from gateway.service.notify import notify_advice
 from gateway.service.schema import DOCUMENTATION_ROOT, Config, LineTable, parse_listen, parse_root
 from gateway.service.snmp import snmp_advice, snmp_on
 from gateway.service.tls import tls_advice
@@ -29,7 +30,7 @@ GUESSED_COMMUNITIES = ("public", "private")
 
 def advice(config: Config, budgets: Sequence[LineBudget]) -> tuple[str, ...]:
     """What an experienced colleague would say about the file; `budgets` in the order of the lines."""
-    return (*_lines(config, budgets), *_modbus(config), *_snmp(config), *_http(config))
+    return (*_lines(config, budgets), *_modbus(config), *_snmp(config), *notify_advice(config), *_http(config))
 
 
 def _lines(config: Config, budgets: Sequence[LineBudget]) -> Iterator[str]:
@@ -41,6 +42,7 @@ def _lines(config: Config, budgets: Sequence[LineBudget]) -> Iterator[str]:
             yield (
                 f"{path}: polling would take {budget.use_ratio:.0%} of the line, so live values come every "
                 f"{budget.live_refresh_s:.1f} s; ask for them less often (poll.live_s) or use a second line"
+                + ("; the daily logs wait for idle time" if config.history.enabled else "")
             )
         if budget.live_refresh_s >= config.cache.max_age_s:
             yield (

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 
 from gateway.devices.schema import load_map, models
 from gateway.service.emc1 import emc1_problems
+from gateway.service.notify import notify_problems
 from gateway.service.problems import Path, Problem, render_path, show, table_at
 from gateway.service.schema import NOT_SUPPORTED, Address, parse_listen
 from gateway.service.schema_tls import TlsTable
@@ -46,6 +47,7 @@ def cross_problems(raw: Raw) -> list[Problem]:
     emc1 = list(_tables(snmp, "emc1", ("snmp",)))
     problems += _repeated(((*path, "unit_id"), table.get("unit_id")) for path, table in emc1)
     problems += emc1_problems(emc1, devices)
+    problems += notify_problems(list(_tables(snmp, "notify", ("snmp",))), users)
     problems += _line_listeners(raw, [line.get("name") for _, line in lines])
     problems += _listen_clashes(raw, ("modbus", "http"))
     problems += _listen_clashes(raw, ("snmp",))

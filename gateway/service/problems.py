@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from gateway.service.schema import UNSUPPORTED, Config, Key, Table
+from gateway.service.schema import Config, Key, Table
 
 Path = tuple[str | int, ...]
 
@@ -125,9 +125,6 @@ def _text(error: ErrorDetails) -> str:
 
 
 def _unknown(path: Path) -> str:
-    names = tuple(part for part in path if isinstance(part, str))
-    if names in UNSUPPORTED:
-        return UNSUPPORTED[names]
     table = table_at(path[:-1])
     keys = tuple(table.model_fields) if table else ()
     near = difflib.get_close_matches(str(path[-1]), keys, n=1)

@@ -4,7 +4,7 @@ Rule 1: a key exists only here, those of SNMP in service/schema_snmp.py. Problem
 docs/configuration.md and the suggestions for misspelt keys are checked against (or made from) these classes.
 Rule 2: a class checks one value at a time. Whatever compares two keys lives in service/crosscheck.py, which
 works on the raw file, so that both kinds of problem are reported together.
-Rule 3: a key that this version cannot honour is not here; `UNSUPPORTED` says so by name.
+Rule 3: a key that this version cannot honour is not here.
 """
 
 from __future__ import annotations
@@ -40,13 +40,12 @@ from gateway.service.keys import (
     parse_range,
     parse_root,
 )
-from gateway.service.schema_snmp import CommunityTable, Emc1Table, SnmpTable, UserTable, ViewTable
+from gateway.service.schema_snmp import CommunityTable, Emc1Table, NotifyTable, SnmpTable, UserTable, ViewTable
 from gateway.service.schema_tls import ROLES, Roles, TlsTable
 
 __all__ = [
     "DOCUMENTATION_ROOT",
     "NOT_SUPPORTED",
-    "UNSUPPORTED",
     "Address",
     "CacheTable",
     "ClientNetworkTable",
@@ -60,6 +59,7 @@ __all__ = [
     "LineTable",
     "ListenerTable",
     "ModbusTable",
+    "NotifyTable",
     "PollTable",
     "RateTable",
     "SnmpTable",
@@ -75,11 +75,6 @@ __all__ = [
 
 PORT_SCHEMES = ("rfc2217", "socket")
 NOT_SUPPORTED = "not supported in this version"
-
-UNSUPPORTED = {
-    ("snmp", "notify"): f"traps and informs are {NOT_SUPPORTED}; allowed: leave the table out",
-}
-"""Keys of later versions, by their path without list positions, with what to tell the reader."""
 
 _LINE = LineSettings(name="", index=1, port="")
 _POLL = PollSettings()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
@@ -16,8 +17,10 @@ from gateway.service.keys import (
     Listens,
     Networks,
     Rate,
+    Seconds,
     Table,
     Text,
+    parse_listen,
     parse_oid,
     parse_root,
 )
@@ -38,8 +41,17 @@ def _oid(text: str) -> str:
     return text
 
 
+def _receiver(text: str) -> str:
+    address = parse_listen(text)
+    host = ipaddress.ip_address(address.host)
+    if not address.port or host.is_unspecified or host.is_multicast:
+        raise ValueError("nobody can be reached there")
+    return str(address)
+
+
 Oids = Annotated[tuple[Annotated[str, AfterValidator(_oid)], ...], Field(strict=False)]
 Credential = Annotated[str, Field(pattern=r"^(/[^\x00-\x1f]+|[A-Za-z0-9_][A-Za-z0-9_.-]{0,254})$", repr=False)]
+OptionalCredential = Annotated[str, Field(pattern=r"^(/[^\x00-\x1f]+|[A-Za-z0-9_][A-Za-z0-9_.-]{0,254})?$")]
 ViewName = Annotated[str, Field(pattern=r"^[!-~]{0,32}$")]
 
 
@@ -115,6 +127,49 @@ class Emc1Table(Table):
     ] = ()
 
 
+class NotifyTable(Table):
+    """`[[snmp.notify]]`: who is told of conditions by traps or informs; nobody by default."""
+
+    address: Annotated[
+        Annotated[str, AfterValidator(_receiver)],
+        Key(
+            'an IP address with a port, such as "192.0.2.7:162" or "[2001:db8::7]:162"',
+            "Where the receiver listens (UDP); 162 is the usual port.",
+        ),
+    ]
+    kind: Annotated[
+        Literal["trap", "inform"],
+        Key('"trap" or "inform"', "Sent once, or repeated until the receiver acknowledges it."),
+    ] = "inform"
+    user: Annotated[
+        Annotated[str, Field(pattern=r"^[!-~]{0,32}$")],
+        Key(
+            'the name of an [[snmp.user]], or ""',
+            "Send by SNMPv3 as this user, signed and encrypted; either this or community_file.",
+        ),
+    ] = ""
+    community_file: Annotated[
+        OptionalCredential,
+        Key(f'{_SECRET_FILE}, or ""', "Holds the community to send with by SNMP v2c; either this or user."),
+    ] = ""
+    severity: Annotated[
+        Literal["info", "warning", "critical"],
+        Key('"info", "warning" or "critical"', "Nothing less severe is told."),
+    ] = "info"
+    hold_s: Annotated[
+        Seconds,
+        Key(
+            "0.0 to 86400.0",
+            "The receiver is told of one condition again so much later at the earliest; what holds then is what it is"
+            " told.",
+        ),
+    ] = Field(default=30.0, ge=0.0, le=86400.0)
+    per_minute: Annotated[
+        Rate,
+        Key("1.0 to 6000.0", "Notifications in the long run; a minute's worth may come at once. The rest waits."),
+    ] = Field(default=60.0, ge=1.0, le=6000.0)
+
+
 class SnmpTable(Table):
     """`[snmp]`: the SNMP face; its port is opened only when there is a community or a user."""
 
@@ -156,4 +211,12 @@ class SnmpTable(Table):
     emc1: Annotated[
         Annotated[tuple[Emc1Table, ...], Field(strict=False)],
         Key("[[snmp.emc1]] tables", "Controllers that are shown also as Morningstar's EMC-1 would show them."),
+    ] = ()
+    authentication_traps: Annotated[
+        bool,
+        Key("true or false", "Receivers are told of wrong communities and pass phrases, once a minute at most."),
+    ] = False
+    notify: Annotated[
+        Annotated[tuple[NotifyTable, ...], Field(strict=False)],
+        Key("[[snmp.notify]] tables", "Who is told of conditions by traps or informs; without one nobody is."),
     ] = ()

@@ -8,7 +8,6 @@ problem when the gateway starts.
 from __future__ import annotations
 
 import ipaddress
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path as FilePath
 
@@ -18,13 +17,12 @@ from gateway.faces.snmp.settings import EVERYTHING, Community, SnmpSettings, Use
 from gateway.faces.snmp.usm import MIN_PASS_PHRASE, Auth, Credentials, Priv, fits
 from gateway.service.emc1 import emc1_devices
 from gateway.service.keys import parse_oid
+from gateway.service.notify import receivers, unreadable_communities
 from gateway.service.problems import Path, Problem, show
 from gateway.service.schema import Config, UserTable, parse_listen, parse_root
+from gateway.service.secret_files import open_to_all, read_line, unreadable_text
 
 Raw = Mapping[str, object]
-
-MOST_OCTETS = 1024
-"""Of a file with a pass phrase."""
 
 _PASSWORDS = ("auth_password_file", "priv_password_file")
 _AUTH = {each.label: each for each in Auth}
@@ -40,12 +38,13 @@ def snmp_settings(config: Config) -> SnmpSettings:
     views = {"": EVERYTHING} | {
         view.name: View(tuple(map(parse_oid, view.include)), tuple(map(parse_oid, view.exclude))) for view in snmp.view
     }
+    credentials = [_credentials(index, user) for index, user in enumerate(snmp.user)]
     return SnmpSettings(
         listen=tuple((at.host, at.port) for at in map(parse_listen, snmp.listen)) if snmp_on(config) else (),
         communities=tuple(Community(each.name, _networks(each.source), views[each.view]) for each in snmp.community),
         users=tuple(
-            User(_credentials(index, user), _networks(user.source), views[user.view])
-            for index, user in enumerate(snmp.user)
+            User(secret, _networks(user.source), views[user.view])
+            for secret, user in zip(credentials, snmp.user, strict=True)
         ),
         enterprise_root=parse_root(snmp.enterprise_root),
         contact=snmp.contact,
@@ -55,6 +54,8 @@ def snmp_settings(config: Config) -> SnmpSettings:
         renew_engine=snmp.engine_lost == "new",
         requests_per_s=snmp.requests_per_s,
         emc1=emc1_devices(config, listen=snmp_on(config)),
+        receivers=receivers(config, dict(zip((user.name for user in snmp.user), credentials, strict=True))),
+        authentication_traps=snmp.authentication_traps,
     )
 
 
@@ -82,13 +83,14 @@ def snmp_problems(
 
 
 def unreadable(config: Config) -> Iterator[str]:
-    """The pass phrases that cannot be read here and now, by key path."""
+    """The pass phrases and communities that cannot be read here and now, by key path."""
     for index, user in enumerate(config.snmp.user):
         for key in _PASSWORDS:
             try:
                 read_pass_phrase(getattr(user, key))
             except OSError as error:
-                yield f"snmp.user[{index}].{key}: {_unreadable(getattr(user, key), error)}"
+                yield f"snmp.user[{index}].{key}: {unreadable_text(getattr(user, key), error)}"
+    yield from unreadable_communities(config)
 
 
 def snmp_advice(config: Config) -> Iterator[str]:
@@ -100,26 +102,12 @@ def snmp_advice(config: Config) -> Iterator[str]:
             if network.prefixlen == 0:
                 yield f"snmp.user[{index}].source[{number}]: {network} is everybody"
         for key in _PASSWORDS:
-            path = pass_phrase_path(getattr(user, key))
-            if path.is_file() and path.stat().st_mode & 0o007:  # it is there: its name is no secret
-                mode = f"{path.stat().st_mode & 0o777:03o}"
-                yield f"snmp.user[{index}].{key}: {path} is open to every user of this machine (mode {mode})"
-
-
-def pass_phrase_path(text: str) -> FilePath:
-    """Where the pass phrase is: a path as it stands, a bare name among systemd's credentials (LoadCredential=)."""
-    if text.startswith("/"):
-        return FilePath(text)
-    return FilePath(os.environ.get("CREDENTIALS_DIRECTORY", "/run/credentials/prostar-gateway.service"), text)
+            yield from open_to_all(f"snmp.user[{index}].{key}", getattr(user, key))
 
 
 def read_pass_phrase(text: str) -> Secret:
     """The one line of the file. OSError when it cannot be read, ValueError when it is no pass phrase to use."""
-    with pass_phrase_path(text).open("rb") as file:
-        content = file.read(MOST_OCTETS + 1)
-    line = content.removesuffix(b"\n").removesuffix(b"\r")
-    if len(content) > MOST_OCTETS or b"\n" in line:
-        raise ValueError("holds more than one line")
+    line = read_line(text)
     if len(line) < MIN_PASS_PHRASE:
         raise ValueError(f"holds fewer than {MIN_PASS_PHRASE} characters, which is too easily guessed (RFC 3414 §11.2)")
     return Secret(line)
@@ -145,16 +133,11 @@ def _credentials(index: int, user: UserTable) -> Credentials:
         try:
             secrets.append(read_pass_phrase(text))
         except OSError as error:
-            raise ConfigError((f"snmp.user[{index}].{key}: {_unreadable(text, error)}",)) from None
+            raise ConfigError((f"snmp.user[{index}].{key}: {unreadable_text(text, error)}",)) from None
         except ValueError as error:
             raise ConfigError((f"snmp.user[{index}].{key}: {error}",)) from None
     auth, priv = secrets
     return Credentials(user.name.encode(), _AUTH[user.auth], auth, _PRIV[user.priv], priv)
-
-
-def _unreadable(text: str, error: OSError) -> str:
-    what = text if text.startswith("/") else "the systemd credential of this name"
-    return f"{what} cannot be read: {error.strerror or error}"
 
 
 def _networks(texts: Sequence[str]) -> tuple[ipaddress.IPv4Network | ipaddress.IPv6Network, ...]:

@@ -99,6 +99,12 @@ SCENARIOS = (
         {90: 0},
     ),
     Scenario(
+        "ProstarHistoryWaits",
+        [series("prostar_gateway_history_wait_seconds", "86000+60x30 0x30")],
+        {6: 0, 20: 1, 40: 0},
+        "warning",
+    ),
+    Scenario(
         "MorningstarOffline",
         [
             state("offline", "0x5 1x20 0x20"),

@@ -51,8 +51,15 @@ class VirtualClock:
 class VirtualPort:
     """A `LinePort` over an engine and a simulated line."""
 
-    def __init__(self, clock: VirtualClock, stations: list[Station], live_s: float, name: str = "shelter-a") -> None:
-        settings = LineSettings(name=name, index=1, port="virtual", poll=PollSettings(live_s=live_s))
+    def __init__(
+        self,
+        clock: VirtualClock,
+        stations: list[Station],
+        live_s: float,
+        name: str = "shelter-a",
+        settings_s: float = 300.0,
+    ) -> None:
+        settings = LineSettings(name=name, index=1, port="virtual", poll=PollSettings(live_s, settings_s))
         self.name, self.index, self.port = name, 1, "virtual"
         self.clock = clock
         self.wire = SimulatedLine(stations)

@@ -280,7 +280,7 @@ listen = ["127.0.0.1:70000"]
         ),
         (
             MINIMAL + '[[snmp.notify]]\nkind = "trap"\n',
-            "snmp.notify: traps and informs are not supported in this version",
+            "snmp.notify[0].address: is missing",
         ),
         (MINIMAL + '[snmp]\nenterprise_root = "1.3.6.1.4.1"\n', 'snmp.enterprise_root: "1.3.6.1.4.1" is not allowed;'),
         (

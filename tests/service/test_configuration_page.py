@@ -31,6 +31,7 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "`[[snmp.user]]`": schema.UserTable,
     "`[[snmp.view]]`": schema.ViewTable,
     "`[[snmp.emc1]]`": schema.Emc1Table,
+    "`[[snmp.notify]]`": schema.NotifyTable,
     "`[http]`": schema.HttpTable,
     "`[history]`": schema.HistoryTable,
 }
@@ -57,9 +58,3 @@ def test_the_table_of_a_section_is_the_schema(heading: str) -> None:
     section = TEXT.partition(f"\n## {heading}\n")[2].partition("\n## ")[0]
     rows = re.findall(r"^\| `.*$", section, re.MULTILINE)
     assert rows == [row(name, field) for name, field in SECTIONS[heading].model_fields.items()]
-
-
-def test_what_is_not_supported_is_named() -> None:
-    section = TEXT.partition("## Not supported in this version")[2]
-    for path in schema.UNSUPPORTED:
-        assert f"[[{'.'.join(path)}]]" in section

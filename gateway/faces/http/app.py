@@ -1,6 +1,7 @@
 """The HTTP face: everything from memory but `/api/v1/log`, which is from the history.
 
-`/metrics`, `/sd` and `/api/v1/clients` for programs, a page for people, `/healthz` and `/readyz` for supervisors.
+`/metrics`, `/sd`, `/api/v1/clients` and `/api/v1/conditions` for programs, a page for people, `/healthz` and `/readyz`
+for supervisors.
 Nothing here reads a line or waits for one, whatever is asked. `/healthz` answers as long as the loop runs;
 `/readyz` says whether the configuration is served as it stands, and is not about the controllers: one that
 is dead is seen in `/metrics`.
@@ -10,17 +11,18 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
 
 from aiohttp import hdrs, web
 
 from gateway.clock import Clock
 from gateway.core.clients import Client
+from gateway.core.conditions import Conditions
 from gateway.core.daylog import DayLog
 from gateway.core.site import Site
-from gateway.core.stats import HistoryStats, ModbusServerStats, ServiceStats
+from gateway.core.stats import HistoryStats, ModbusServerStats, NotifyStats
 from gateway.faces.http import api
 from gateway.faces.http import clients as client_list
+from gateway.faces.http import conditions as condition_list
 from gateway.faces.http.access import Access, guard
 from gateway.faces.http.api import LogApi
 from gateway.faces.http.discovery import targets
@@ -44,7 +46,7 @@ class HttpFace:
 
     `modbus` and `snmp` are the counters of the other faces; `not_ready` gives the reasons why the gateway
     is not ready, none when it is; `history` and `log` are there where a history is kept; `clients` are those
-    of the Modbus TCP face at any moment.
+    of the Modbus TCP face at any moment; `conditions` are None where nobody watches them.
     """
 
     def __init__(
@@ -59,53 +61,25 @@ class HttpFace:
         history: HistoryStats | None = None,
         log: DayLog | None = None,
         clients: Iterable[Client] = (),
-        service: ServiceStats | None = None,
+        conditions: Conditions | None = None,
+        notifications: Sequence[NotifyStats] = (),
     ) -> None:
         self._site = site
         self._clock = clock
         self._not_ready = not_ready
         self.stats = HttpStats()
         self._settings = settings
-        self._access = Access()
-        self._counts = Counts(modbus, snmp, self.stats, not_ready, history, clients, service)
-        self._exposition = Exposition(site, clock, self._counts)
+        counts = Counts(modbus, snmp, self.stats, not_ready, history, clients, conditions, notifications)
+        self._exposition = Exposition(site, clock, counts)
         self._clients = clients
+        self._conditions = conditions
         self._log_api = LogApi(site, log, settings.send_timeout_s)
-        self.listeners: Sequence[HttpListener] = ()
-        self.listeners = self._listeners()
-
-    def adjust(
-        self,
-        settings: HttpSettings,
-        access: Access,
-        site: Site,
-        history: HistoryStats | None,
-        log: DayLog | None,
-    ) -> None:
-        """Go on by other settings, with the credentials that were read of them, for another site.
-
-        `listeners` are those that are wanted then: the same ones where address and kind are the same.
-        """
-        self._settings, self._access, self._site = settings, access, site
-        self._counts = replace(self._counts, history=history)
-        self._exposition.adjust(site, self._counts)
-        self._log_api.adjust(site, log)
-        self.listeners = self._listeners()
-        for listener in self.listeners:
-            listener.adjust(settings)
-
-    def _listeners(self) -> tuple[HttpListener, ...]:
-        """The listeners of the settings; those that there are already are taken."""
-        present = {listener.key: listener for listener in self.listeners}
-        wanted = [
-            HttpListener(host, port, self._application, self._settings, self.stats)
-            for host, port in self._settings.listen
-        ]
-        return tuple(present.get(listener.key, listener) for listener in wanted)
+        self.listeners: Sequence[HttpListener] = tuple(
+            HttpListener(host, port, self._application, settings, self.stats) for host, port in settings.listen
+        )
 
     def _application(self) -> web.Application:
-        self._access = Access.read(self._settings)
-        guarded = guard(lambda: self._access, self._count_refused)
+        guarded = guard(Access.read(self._settings), self._count_refused)
         application = web.Application(client_max_size=0, middlewares=[guarded])
         application.router.add_get("/", self._index)
         application.router.add_get("/metrics", self._metrics)
@@ -114,6 +88,7 @@ class HttpFace:
         application.router.add_get("/readyz", self._readyz)
         application.router.add_get(api.PATH, self._log_api.handle)
         application.router.add_get(client_list.PATH, self._who_asks)
+        application.router.add_get(condition_list.PATH, self._what_is_wrong)
         return application
 
     async def _metrics(self, request: web.Request) -> web.StreamResponse:
@@ -150,6 +125,18 @@ class HttpFace:
 
     async def _who_asks(self, _request: web.Request) -> web.Response:
         found = client_list.clients_document(self._clients, self._clock.monotonic())
+        return web.json_response(found, headers=_NO_STORE)
+
+    async def _what_is_wrong(self, request: web.Request) -> web.Response:
+        try:
+            everything = condition_list.wants_all(request.query)
+        except ValueError as error:
+            return web.json_response({"error": str(error)}, status=400, headers=_NO_STORE)
+        if self._conditions is None:
+            return web.json_response({"error": "nobody watches conditions"}, status=404, headers=_NO_STORE)
+        now = self._clock.monotonic()
+        self._conditions.look(now)
+        found = condition_list.conditions_document(self._conditions, now, everything=everything)
         return web.json_response(found, headers=_NO_STORE)
 
     def _count_refused(self) -> None:

@@ -22,6 +22,12 @@ class DeviceHistoryView:
         at = self.stats.harvested_at
         return None if at is None else max(0.0, self.now - at)
 
+    @property
+    def wait_s(self) -> float:
+        """How long a read has been waiting; 0 when none waits."""
+        since = self.stats.waiting_since
+        return 0.0 if since is None else max(0.0, self.now - since)
+
 
 DEVICE_HISTORY_RULES: tuple[Rule[DeviceHistoryView], ...] = (
     known(
@@ -45,6 +51,14 @@ DEVICE_HISTORY_RULES: tuple[Rule[DeviceHistoryView], ...] = (
             *DEVICE_LABELS,
         ),
         lambda view: view.age_s,
+    ),
+    one(
+        gateway_gauge(
+            "history_wait_seconds",
+            "How long a read of the daily log has been waiting for idle time on its line; 0 while none waits.",
+            *DEVICE_LABELS,
+        ),
+        lambda view: view.wait_s,
     ),
     one(
         gateway_counter("history_harvests", "How often the daily log was read to its end.", *DEVICE_LABELS),

@@ -11,10 +11,19 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from gateway import __version__
+from gateway.clock import Clock
 from gateway.core.clients import Client
+from gateway.core.conditions import Conditions, DeviceConditions
 from gateway.core.site import Site
-from gateway.core.stats import HistoryStats, ModbusServerStats, ServiceStats, TlsStats
+from gateway.core.stats import HistoryStats, ModbusServerStats, NotifyStats, TlsStats
 from gateway.faces.http.clients import CLIENT_RULES, client_sources
+from gateway.faces.http.conditions import (
+    DEVICE_CONDITION_RULES,
+    GATEWAY_CONDITION_RULES,
+    NOTIFY_RULES,
+    gateway_sources,
+    receiver_source,
+)
 from gateway.faces.http.devices import DEVICE_LABELS, device_labels
 from gateway.faces.http.history import DEVICE_HISTORY_RULES, STORE_RULES, DeviceHistoryView
 from gateway.faces.http.lines import DEVICE_RULES, LINE_LABELS, LINE_RULES, LineView
@@ -52,29 +61,6 @@ GATEWAY_RULES: tuple[Rule[GatewayView], ...] = (
     one(
         gateway_gauge("ready", "1 while everything that is configured listens, as /readyz says."),
         lambda view: view.ready,
-    ),
-)
-
-SERVICE_RULES: tuple[Rule[ServiceStats], ...] = (
-    one(
-        gateway_gauge(
-            "config_last_reload_successful", "1 while the configuration that was last read is the one in use."
-        ),
-        lambda stats: stats.reload_works,
-    ),
-    one(
-        gateway_gauge(
-            "config_last_reload_success_timestamp_seconds", "When the configuration in use was read, Unix time."
-        ),
-        lambda stats: stats.configured_at,
-    ),
-    each(
-        gateway_counter("config_reloads", "Times that the configuration was read again, by outcome.", "outcome"),
-        lambda stats: dict.fromkeys(("applied", "refused"), 0) | stats.reloads,
-    ),
-    each(
-        gateway_counter("task_restarts", "Times that a task died of a bug and was started again.", "task"),
-        lambda stats: stats.restarts,
     ),
 )
 
@@ -178,7 +164,6 @@ OWN_METRICS: tuple[MetricInfo, ...] = tuple(
     rule.metric
     for rules in (
         GATEWAY_RULES,
-        SERVICE_RULES,
         LINE_RULES,
         DEVICE_RULES,
         MODBUS_RULES,
@@ -188,6 +173,9 @@ OWN_METRICS: tuple[MetricInfo, ...] = tuple(
         HTTP_RULES,
         STORE_RULES,
         DEVICE_HISTORY_RULES,
+        DEVICE_CONDITION_RULES,
+        GATEWAY_CONDITION_RULES,
+        NOTIFY_RULES,
     )
     for rule in rules
 )
@@ -212,16 +200,16 @@ class Counts:
     not_ready: Callable[[], Sequence[str]] = _no_reasons
     history: HistoryStats | None = None  # None: no history is kept
     clients: Iterable[Client] = ()
-    service: ServiceStats | None = None  # None: nobody supervises it
+    conditions: Conditions | None = None  # None: nobody watches them
+    notifications: Sequence[NotifyStats] = ()
 
 
 class OwnMetrics:
     """The gateway's own metrics, each line and counter read once a scrape."""
 
-    def __init__(self, site: Site, counts: Counts, started_at: float) -> None:
-        """`started_at` is wall time."""
+    def __init__(self, site: Site, clock: Clock, counts: Counts) -> None:
         self._counts = counts
-        self._started_at = started_at
+        self._started_at = clock.wall()
         self._lines = [Source.labelled(line, LINE_LABELS, (line.name, site.name)) for line in site.lines]
         self._devices = [Source.labelled(device, DEVICE_LABELS, device_labels(site, device)) for device in site.devices]
 
@@ -230,8 +218,6 @@ class OwnMetrics:
         counts = self._counts
         lines = [Source(LineView(line.of, line.of.status(now)), line.labels, line.written) for line in self._lines]
         yield from families(GATEWAY_RULES, [Source(GatewayView(self._started_at, not counts.not_ready()))])
-        if counts.service is not None:
-            yield from families(SERVICE_RULES, [Source(counts.service)])
         yield from families(LINE_RULES, lines)
         yield from families(DEVICE_RULES, self._devices)
         yield from families(MODBUS_RULES, [Source(counts.modbus)])
@@ -243,6 +229,18 @@ class OwnMetrics:
         if counts.history is not None:
             yield from families(STORE_RULES, [Source(counts.history)])
             yield from families(DEVICE_HISTORY_RULES, self._histories(counts.history, now))
+        if counts.conditions is not None:
+            yield from families(DEVICE_CONDITION_RULES, self._conditions(counts.conditions, now))
+            yield from families(GATEWAY_CONDITION_RULES, gateway_sources(counts.conditions))
+        yield from families(NOTIFY_RULES, [receiver_source(stats) for stats in counts.notifications])
+
+    def _conditions(self, conditions: Conditions, now: float) -> list[Source[DeviceConditions]]:
+        found = []
+        for device in self._devices:
+            of = conditions.devices[device.of.unit_id]
+            of.look(now)
+            found.append(Source(of, device.labels, device.written))
+        return found
 
     def _histories(self, history: HistoryStats, now: float) -> list[Source[DeviceHistoryView]]:
         return [

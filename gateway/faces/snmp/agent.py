@@ -24,6 +24,7 @@ from gateway.faces.snmp.counters import SnmpCounters
 from gateway.faces.snmp.emc1 import context_of, emc1_tree
 from gateway.faces.snmp.engine import Engine, EngineLost, start_engine
 from gateway.faces.snmp.layout import Layout, shipped_layout
+from gateway.faces.snmp.notifier import Notifier
 from gateway.faces.snmp.objects import Gateway
 from gateway.faces.snmp.responder import DATAGRAM_LIMIT, Refused, Responder
 from gateway.faces.snmp.security import Security
@@ -52,22 +53,17 @@ class SnmpAgent:
         modbus: ModbusServerStats,
         *,
         conditions: Conditions | None = None,
-        before: SnmpAgent | None = None,
     ) -> None:
-        """Without `conditions` of somebody who tells them of the gateway, those of lines and devices are shown.
-
-        With `before` it is made to be given to that one's `adjust`: same counters, same engine, same uptime.
-        """
-        self.counters: SnmpCounters = SnmpCounters() if before is None else before.counters
-        self.started_at: float = clock.monotonic() if before is None else before.started_at
+        """Without `conditions` of somebody who tells them of the gateway, those of lines and devices are shown."""
+        self.counters = SnmpCounters()
         self.layout: Layout = shipped_layout(settings.enterprise_root)
         self._settings = settings
         self._clock = clock
-        self._engine: Engine | None = None if before is None else before._engine  # noqa: SLF001 - its own kind
+        self._engine: Engine | None = None
         described = Gateway(
             site=site,
             version=gateway.__version__,
-            started_at=self.started_at,
+            started_at=clock.monotonic(),
             modbus=modbus,
             snmp=self.counters,
             contact=settings.contact,
@@ -78,6 +74,7 @@ class SnmpAgent:
                 (self.layout.module, "PROSTAR-GATEWAY-MIB: gateway, lines and solar charge controllers"),
                 *entity.CAPABILITIES,
             ),
+            authentication_traps=settings.authentication_traps,
             conditions=conditions if conditions is not None else Conditions(site, (), clock.monotonic()),
         )
         groups = (*standard.GROUPS, entity.GENERAL)
@@ -88,32 +85,20 @@ class SnmpAgent:
         self._trees = tuple(contexts.values())
         self._responder = Responder(settings, contexts, self.counters)
         self._throttle = Throttle()
-        self.listeners: tuple[SnmpListener, ...] = ()
-        self.listeners = self._listeners()
-        if before is None:
-            self._warm_up()
-        elif self._engine is not None:
-            self.prepare()
-
-    def adjust(self, fresh: SnmpAgent) -> None:
-        """Go on as the agent that was made for it: with its settings and trees, as the same engine.
-
-        `listeners` are those that are wanted then: the same ones where address and context are the same.
-        """
-        fresh._responder.on_authentication_failure = self._responder.on_authentication_failure
-        self._settings, self._engine = fresh._settings, fresh._engine
-        self.layout, self.tree, self._trees = fresh.layout, fresh.tree, fresh._trees
-        self._responder = fresh._responder
-        self.listeners = self._listeners()
-
-    def _listeners(self) -> tuple[SnmpListener, ...]:
-        """The listeners of the settings; those that there are already are taken."""
-        settings = self._settings
-        wanted = [SnmpListener(self, host, port) for host, port in settings.listen]
-        for each in settings.emc1:
-            wanted += [SnmpListener(self, host, port, context_of(each.unit_id)) for host, port in each.listen]
-        present = {listener.label: listener for listener in self.listeners}
-        return tuple(present.get(listener.label, listener) for listener in wanted)
+        self.notifier = Notifier(
+            settings.receivers, self.layout, site=site.name, clock=clock, engine=self.engine, ticks=described.ticks
+        )
+        if settings.authentication_traps:
+            self._responder.on_authentication_failure = self.notifier.authentication_failed
+        self.listeners = (
+            *(SnmpListener(self, host, port) for host, port in settings.listen),
+            *(
+                SnmpListener(self, host, port, context_of(each.unit_id))
+                for each in settings.emc1
+                for host, port in each.listen
+            ),
+        )
+        self._warm_up()
 
     def engine(self) -> Engine:
         """The SNMPv3 engine of this start; the first call writes its boots. EngineLost when there can be none."""

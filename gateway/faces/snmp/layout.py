@@ -3,7 +3,9 @@
 ```
 root                     PROSTAR-GATEWAY-REG-MIB, the one configurable OID
  ├ 1 modules             1 PROSTAR-GATEWAY-TC-MIB   2 PROSTAR-GATEWAY-MIB
- │      2.1 objects      1 gateway 2 line 3 device 4 live 5 energy 6 today 7 settings 8 condition 9 Modbus server
+ │      2.0 notifications
+      2.1 objects      1 gateway 2 line 3 device 4 live 5 energy 6 today 7 settings 8 condition 9 Modbus server
+                       10 what only notifications carry
  │      2.2 conformance  1 groups 2 compliances
  └ 2 products            1 this gateway (sysObjectID)
 ```
@@ -24,7 +26,7 @@ from dataclasses import dataclass, replace
 from gateway.devices.model import Bit, DeviceMap, EnumValue, Group, Point
 from gateway.devices.schema import load_map, models
 from gateway.errors import MapError
-from gateway.faces.snmp import condition_tables, tables
+from gateway.faces.snmp import condition_tables, notifications, tables
 from gateway.faces.snmp.objects import (
     CellValue,
     Changes,
@@ -82,6 +84,7 @@ class Layout:
     groups: tuple[ScalarGroup, ...]
     tables: tuple[Table, ...]
     conventions: tuple[Convention, ...]  # by name
+    notify: ScalarGroup  # objects that only notifications carry: described, never served
 
     @property
     def modules(self) -> Oid:
@@ -92,6 +95,11 @@ class Layout:
     def module(self) -> Oid:
         """Identity of PROSTAR-GATEWAY-MIB."""
         return (*self.modules, 2)
+
+    @property
+    def notifications(self) -> Oid:
+        """Parent of the notifications (RFC 2578 §8.5: its last arc is 0)."""
+        return (*self.module, 0)
 
     @property
     def objects(self) -> Oid:
@@ -158,11 +166,12 @@ def layout(maps: Iterable[DeviceMap], root: Oid = DEFAULT_ROOT) -> Layout:
         )
         for number, name, group, description in _POINT_TABLES
     )
-    described = [each for group in groups for each in group.objects]
+    notify = ScalarGroup((*objects, 10), 10, "pgwNotify", "What only notifications carry.", notifications.NOTIFY)
+    described = [each for group in (*groups, notify) for each in group.objects]
     described += [column for table in (*fixed, *of_points) for column in table.columns]
     in_use = {each.convention.name: each.convention for each in described if each.convention is not None}
     conventions = tuple(in_use[name] for name in sorted(in_use))
-    return Layout(root, groups, tuple(table for table in (*fixed, *of_points) if table.columns), conventions)
+    return Layout(root, groups, tuple(table for table in (*fixed, *of_points) if table.columns), conventions, notify)
 
 
 def shipped_layout(root: Oid = DEFAULT_ROOT) -> Layout:

@@ -73,6 +73,7 @@ class Gateway:
     object_id: Oid  # sysObjectID
     capabilities: tuple[tuple[Oid, str], ...]  # rows of sysORTable
     conditions: Conditions | None = None  # None: nobody watches them
+    authentication_traps: bool = False  # whether authenticationFailure is sent
 
     def ticks(self, at: float) -> int:
         """Moment `at` as sysUpTime, hundredths of a second; 0 for moments before the start."""

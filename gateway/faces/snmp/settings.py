@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from ipaddress import IPv4Network, IPv6Network
 from pathlib import Path
 
+from gateway.core.conditions import Severity
+from gateway.faces.snmp.secret import Secret
 from gateway.faces.snmp.usm import Credentials
 
 Network = IPv4Network | IPv6Network
@@ -72,6 +74,25 @@ class Emc1Device:
     listen: tuple[tuple[str, int], ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class Receiver:
+    """Who is told of conditions: by a community (v2c) or as a user (v3), one of the two."""
+
+    host: str  # an IP address
+    port: int
+    inform: bool  # acknowledged, and repeated until it is; otherwise a trap
+    community: Secret | None = None
+    credentials: Credentials | None = None
+    least: Severity = Severity.INFO  # what is less severe is not told
+    hold_s: float = 30.0  # least time between two notifications about one condition
+    per_minute: float = 60.0  # notifications in the long run; a minute's worth may come at once
+
+    @property
+    def label(self) -> str:
+        """Address and port."""
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
 REPLY_LIMIT = 1400
 """Octets of the longest reply: fits a frame over IPv6 and a tunnel, so it is never cut on the way."""
 
@@ -92,3 +113,5 @@ class SnmpSettings:
     requests_per_s: float = 2000.0  # of one source in the long run; ten seconds' worth may come at once
     reply_octets: int = REPLY_LIMIT
     emc1: tuple[Emc1Device, ...] = ()
+    receivers: tuple[Receiver, ...] = ()
+    authentication_traps: bool = False  # whether receivers are told of wrong credentials

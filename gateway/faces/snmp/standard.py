@@ -29,7 +29,7 @@ SNMP_MIB: Oid = (1, 3, 6, 1, 6, 3, 1)
 APPLICATIONS = 64 + 8
 """sysServices: end-to-end and application layer, what RFC 3418 gives a host."""
 
-AUTHEN_TRAPS_DISABLED = 2
+_AUTHEN_TRAPS = {True: 1, False: 2}  # enabled, disabled
 
 
 def _fixed(number: int, name: str, syntax: Syntax, get: Callable[..., CellValue]) -> ObjectType:
@@ -72,7 +72,12 @@ GROUPS: tuple[ScalarGroup, ...] = (
             _counter(4, "snmpInBadCommunityNames", lambda gateway: gateway.snmp.bad_community_names),
             _counter(5, "snmpInBadCommunityUses", lambda gateway: gateway.snmp.bad_community_uses),
             _counter(6, "snmpInASNParseErrs", lambda gateway: gateway.snmp.parse_errors),
-            _fixed(30, "snmpEnableAuthenTraps", Syntax.ENUMERATION, lambda _gateway: AUTHEN_TRAPS_DISABLED),
+            _fixed(
+                30,
+                "snmpEnableAuthenTraps",
+                Syntax.ENUMERATION,
+                lambda gateway: _AUTHEN_TRAPS[gateway.authentication_traps],
+            ),
             _counter(31, "snmpSilentDrops", lambda gateway: gateway.snmp.silent_drops),
             _fixed(32, "snmpProxyDrops", Syntax.COUNTER32, lambda _gateway: 0),
         ),

@@ -10,9 +10,10 @@ import pytest
 
 from gateway import __version__
 from gateway.core.clients import ClientTable
+from gateway.core.conditions import HISTORY_DOWN, Conditions
 from gateway.core.ratelimit import ClientRate
 from gateway.core.site import LineState, Site
-from gateway.core.stats import DeviceHistoryStats, HistoryStats, ModbusServerStats, ServiceStats, TlsStats
+from gateway.core.stats import DeviceHistoryStats, HistoryStats, ModbusServerStats, NotifyStats, TlsStats
 from gateway.faces.http.exposition import Exposition
 from gateway.faces.http.lines import ERROR_KINDS
 from gateway.faces.http.metric import MetricInfo, MetricKind
@@ -108,9 +109,21 @@ def test_what_is_collected_is_what_is_described(site: Site, clock: ManualClock) 
     history = HistoryStats({11: of_device}, store_up=True, store_errors=Counter(full=1))
     clients = ClientTable(modbus, burst_s=2.0)
     clients.arrived("10.0.0.1", ClientRate(), clock.now).exceptions[2] = 1
-    service = ServiceStats(restarts=Counter(history=1))
-    counts = Counts(modbus, lambda: {"get": 1}, history=history, clients=clients, service=service)
-    exposition = Exposition(site, clock, counts)
+    conditions = Conditions(site, (HISTORY_DOWN,), clock.now)
+    conditions.gateway.tell(HISTORY_DOWN, raised=True, now=clock.now)
+    notifications = [NotifyStats("192.0.2.7:162", "inform", refused=Counter(user=1))]
+    exposition = Exposition(
+        site,
+        clock,
+        Counts(
+            modbus,
+            lambda: {"get": 1},
+            history=history,
+            clients=clients,
+            conditions=conditions,
+            notifications=notifications,
+        ),
+    )
 
     def collected() -> Iterator[tuple[str, str, str, set[str]]]:
         for family in parse(scrape(exposition)):

@@ -128,7 +128,7 @@ def test_a_missing_pass_phrase_is_advice_when_checked_and_stops_the_start(
     assert f"snmp.user[0].auth_password_file: {folder}/auth is open to every user of this machine (mode 644)" in shown
     assert run("run", "-c", str(folder / "c.toml")) == 78
     assert "snmp.user[0].priv_password_file" in capsys.readouterr().err
-    with pytest.raises(ConfigError, match=r"snmp\.user\[0\]: .*priv cannot be read"):
+    with pytest.raises(ConfigError, match=r"snmp\.user\[0\]\.priv_password_file: .*priv cannot be read"):
         snmp_settings(load_config(folder / "c.toml"))
 
 
