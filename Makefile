@@ -38,6 +38,18 @@ test: setup lint ## Set everything up, lint, and run the tests with coverage.
 test-long: setup ## Run the long tier: whole simulated days.
 	@$(BIN)/python -m pytest -m long --timeout=3600
 
+.PHONY: test-newest
+test-newest: setup ## Run what depends on libraries with the newest versions that pyproject.toml allows.
+	@echo 'Making $(VENV)-newest:'
+	@rm -rf $(VENV)-newest; $(BIN)/python -m venv $(VENV)-newest
+	$(call step,newest versions,$(VENV)-newest/bin/python -m pip --disable-pip-version-check --quiet --quiet install --editable '.[fast$(COMMA)dev]')
+	@$(VENV)-newest/bin/python -m tests.supply.versions requirements-dev.txt
+	@$(VENV)-newest/bin/python -m pytest -m 'not long' -n $(JOBS) $(LIBRARY_TESTS)
+
+COMMA := ,
+# The rooms where behaviour of pymodbus, pysnmp, pyserial, prometheus-client and aiohttp shows.
+LIBRARY_TESTS := tests/characterisation tests/conformance tests/modbus tests/lines tests/faces
+
 .PHONY: coverage
 coverage: ## Show which lines the last `make test` did not reach.
 	@$(BIN)/python -m coverage report
@@ -69,12 +81,17 @@ setup: $(VENV)/.dev ## Make .venv and install the foreign programs that tests ta
 lock: $(VENV)/.dev ## Write requirements*.txt anew from pyproject.toml.
 	$(call step,requirements-dev.txt,$(PIP_COMPILE) --extra dev --output-file requirements-dev.txt pyproject.toml)
 	$(call step,requirements.txt,$(PIP_COMPILE) --constraint requirements-dev.txt --output-file requirements.txt pyproject.toml)
+	$(call step,requirements-audit.txt,$(LOCK) --output-file requirements-audit.txt requirements-audit.in)
 
 # No index, host or option of the machine that locks gets into the files. What builds the project itself is
 # locked with it, so that installing it needs no network of its own. UPGRADE=1 takes the newest versions.
-PIP_COMPILE = $(BIN)/pip-compile --quiet --generate-hashes --strip-extras --allow-unsafe --no-header \
-	--no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-emit-options \
-	--build-deps-for editable --extra fast $(if $(UPGRADE),--upgrade)
+LOCK = $(BIN)/pip-compile --quiet --generate-hashes --strip-extras --allow-unsafe --no-header \
+	--no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-emit-options $(if $(UPGRADE),--upgrade)
+PIP_COMPILE = $(LOCK) --build-deps-for editable --extra fast
+
+.PHONY: audit
+audit: $(VENV)/.runtime $(VENV)-audit/.ready ## Write licences and an SBOM to dist/, and ask for known holes of the locked libraries.
+	@$(BIN)/python -m tests.supply.audit --tools $(VENV)-audit/bin --output dist
 
 .PHONY: wheels
 wheels: $(VENV)/.runtime ## Fetch the locked libraries into dist/wheels, for a machine without a network.
@@ -82,7 +99,7 @@ wheels: $(VENV)/.runtime ## Fetch the locked libraries into dist/wheels, for a m
 
 .PHONY: clean
 clean: ## Remove .venv and everything that was made by a tool.
-	@rm -rf $(VENV) build dist htmlcov .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache \
+	@rm -rf $(VENV) $(VENV)-newest $(VENV)-audit build dist htmlcov .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache \
 	  .import_linter_cache *.egg-info
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -117,3 +134,8 @@ $(VENV)/.runtime: requirements.txt pyproject.toml | $(BIN)/python
 $(VENV)/.dev: requirements-dev.txt pyproject.toml | $(BIN)/python
 	$(call install,requirements-dev.txt)
 	@touch $@ $(VENV)/.runtime
+
+$(VENV)-audit/.ready: requirements-audit.txt | $(BIN)/python
+	@rm -rf $(VENV)-audit; $(BIN)/python -m venv $(VENV)-audit
+	$(call step,install requirements-audit.txt,$(VENV)-audit/bin/python -m pip --disable-pip-version-check --quiet --quiet install --require-hashes --requirement requirements-audit.txt)
+	@touch $@

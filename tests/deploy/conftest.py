@@ -18,7 +18,10 @@ from typing import Any
 import pytest
 
 from tests.deploy.promtool import REPOSITORY, RULES
+from tests.e2e.conftest import start
 from tests.e2e.programs import GATEWAY, Program, wait_until, write_config
+
+__all__ = ["start"]
 
 SERVING_S = 20.0
 

@@ -10,6 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 LOCKS = ("requirements.txt", "requirements-dev.txt")
+ALL_LOCKS = (*LOCKS, "requirements-audit.txt")
 PAGES = sorted(page.relative_to(ROOT) for page in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")))
 
 
@@ -35,12 +36,12 @@ def wanted(*extras: str) -> set[str]:
     return {normal(re.split(r"[\s\[<>=!~;]", requirement, maxsplit=1)[0]) for requirement in asked}
 
 
-@pytest.mark.parametrize("name", LOCKS)
+@pytest.mark.parametrize("name", ALL_LOCKS)
 def test_a_lock_names_no_index_and_no_host(name: str) -> None:
     assert not re.search(r"https?://|file://|--(extra-)?index-url|--find-links|--trusted-host", read(name))
 
 
-@pytest.mark.parametrize("name", LOCKS)
+@pytest.mark.parametrize("name", ALL_LOCKS)
 def test_every_locked_package_has_a_hash(name: str) -> None:
     for entry in re.split(r"\n(?=\S)", read(name)):
         if "==" in entry.partition("\n")[0]:

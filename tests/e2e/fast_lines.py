@@ -1,6 +1,7 @@
-"""Three oracle controllers on two ptys at 115200 8N2: `simulate --oracle`, twelve times as fast.
+"""The demo's three controllers on two ptys at 115200 8N2: `simulate --oracle`, twelve times as fast.
 
 Reading all 4514 registers of three controllers twice takes minutes at 9600 baud; what a register holds is the same.
+With `plants` behind the folder they are `simulate` without `--oracle`: a solar day, and a daily log.
 """
 
 from __future__ import annotations
@@ -8,11 +9,14 @@ from __future__ import annotations
 import asyncio
 import signal
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gateway.devices.schema import load_map
 from gateway.modbus.rtu import Timing
-from gateway.simulator.line import SimulatedLine
+from gateway.simulator.device import SimulatedController
+from gateway.simulator.layout import SimulatedSite
+from gateway.simulator.line import SimulatedLine, Station
 from gateway.simulator.oracle import OracleController
 from gateway.simulator.pty import PtyLine
 
@@ -32,13 +36,24 @@ def controllers() -> dict[str, list[OracleController]]:
     return found
 
 
-async def run(folder: Path) -> None:
+def plants() -> dict[str, list[SimulatedController]]:
+    """The same with a plant each."""
+    site = SimulatedSite.build(load_map("prostar-mppt"))
+    found: dict[str, list[SimulatedController]] = {}
+    names = [plan.name for plan in site.plans for _ in plan.addresses]
+    for name, station in zip(names, site.controllers, strict=True):
+        assert isinstance(station, SimulatedController)
+        found.setdefault(name, []).append(station)
+    return found
+
+
+async def run(folder: Path, stations_of: Mapping[str, Sequence[Station]]) -> None:
     """Serve until SIGTERM."""
     stop = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
     timing = Timing.of(BAUDRATE, 8, "N", 2)
     lines = [
-        PtyLine(SimulatedLine(stations, timing=timing), link=folder / name) for name, stations in controllers().items()
+        PtyLine(SimulatedLine(stations, timing=timing), link=folder / name) for name, stations in stations_of.items()
     ]
     for line in lines:
         line.open()
@@ -48,4 +63,4 @@ async def run(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(run(Path(sys.argv[1])))
+    asyncio.run(run(Path(sys.argv[1]), plants() if "plants" in sys.argv else controllers()))
