@@ -175,11 +175,11 @@ class SnmpAgent:
         self.counters.responses += known
 
     def _warm_up(self) -> None:
-        """Encode every cell and answer every kind of request once, so that no first request waits for it."""
+        """Encode a cell of every column and answer every kind of request once, so that no first one waits for it."""
         now = self._clock.monotonic()
         for tree in self._trees:
-            for slot in tree:
-                slot.varbind(now)
+            for column in tree.columns:
+                column.varbind(0, now)
         self._responder.rehearse(now)
 
 

@@ -141,20 +141,26 @@ DEVICE: tuple[ObjectType, ...] = (
 )
 
 
-def _active(gateway: Gateway, _now: float) -> int | None:
+def _active(gateway: Gateway, now: float) -> int | None:
     conditions = gateway.conditions
     if conditions is None:
         return None
-    sets = (conditions.gateway, *conditions.devices.values())
-    return sum(sum(each.active.values()) for each in sets)
+    active = sum(conditions.gateway.active.values())
+    for each in conditions.devices.values():
+        each.look(now)
+        active += sum(each.active.values())
+    return active
 
 
-def _worst(gateway: Gateway, _now: float) -> int | None:
+def _worst(gateway: Gateway, now: float) -> int | None:
     conditions = gateway.conditions
     if conditions is None:
         return None
-    sets = (conditions.gateway, *conditions.devices.values())
-    return max((each.worst or NONE for each in sets), default=NONE)
+    worst = conditions.gateway.worst or NONE
+    for each in conditions.devices.values():
+        each.look(now)
+        worst = max(worst, each.worst or NONE)
+    return worst
 
 
 GATEWAY: tuple[ObjectType, ...] = (

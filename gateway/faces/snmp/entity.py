@@ -306,7 +306,7 @@ def _units(row: EntityRow) -> bytes:
 
 
 def _of_sensor(number: int, name: str, syntax: Syntax, part: Part, changes: Changes = Changes.NEVER) -> ObjectType:
-    return ObjectType(number, name, syntax, "", lambda row, _now: part(row), changes=changes)
+    return ObjectType(number, name, syntax, "", lambda row, _now: part(row), changes=changes, of_values=part is _value)
 
 
 SENSORS = Table(

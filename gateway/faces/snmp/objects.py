@@ -156,6 +156,7 @@ class ObjectType:
     models: frozenset[str] | None = None
     point: str | None = None  # the map's point; without a shown value of it there is no cell
     only: Callable[[Any], bool] | None = None
+    of_values: bool = False  # like `point`, of the row's: a device that shows no values has no cell here
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from gateway.core.site import Device
 from gateway.faces.snmp import reader, wire
+from gateway.faces.snmp.columns import Column
 from gateway.faces.snmp.tree import Window
 
 MOST_CELLS = 1000
@@ -27,10 +28,12 @@ class Reading:
     def get(self, name: bytes) -> tuple[bytes, bool]:
         """The varbind for a name, and whether it has a value."""
         window = self._window
-        place = window.places.get(name)
-        if place is not None:
+        found = window.find(name[2:])
+        if found is not None:
+            number, at = found
+            place = window.starts[number] + at
             self.spans.append((place, place + 1))
-            varbind = window.slots[place].varbind(self._now)
+            varbind = window.columns[number].varbind(at, self._now)
             if varbind is not None:
                 return varbind, True
             return wire.varbind(name, wire.NO_SUCH_INSTANCE), False
@@ -42,7 +45,7 @@ class Reading:
         start = self._behind(name)
         found = self._window.from_place(start, self._now)
         if found is None:
-            self.spans.append((start, len(self._window.slots)))
+            self.spans.append((start, self._window.size))
             return wire.varbind(name, wire.END_OF_MIB_VIEW), False
         self.spans.append((start, found[0] + 1))
         return found[1], True
@@ -73,40 +76,53 @@ class Reading:
 
     def devices(self) -> list[Device] | None:
         """The devices that the result depends on; None when it depends on more than snapshots, or too many cells."""
-        slots = self._window.slots
-        watched: set[object] = set()
+        window = self._window
+        watched: set[Device] = set()
         cells = 0
         for start, end in self.spans:
             cells += end - start
             if cells > MOST_CELLS:
                 return None
-            watched.update([slot.watched for slot in slots[start:end]])
-        return None if None in watched else [each for each in watched if isinstance(each, Device)]
+            place = start
+            while place < end:
+                number, at = window.locate(place)
+                many = min(end, window.starts[number + 1]) - place
+                found = window.columns[number].watched(at, at + many)
+                if found is None:
+                    return None
+                watched.update(found)
+                place += many
+        return list(watched)
 
     def _behind(self, name: bytes) -> int:
         """The first place behind a name."""
-        place = self._window.places.get(name)
-        return self._window.place_after(reader.oid(name)) if place is None else place + 1
+        window = self._window
+        found = window.find(name[2:])
+        return window.place_after(reader.oid(name)) if found is None else window.starts[found[0]] + found[1] + 1
 
     def _column(self, name: bytes, ends: list[int], repetitions: int, left: int, out: list[bytes]) -> None:
         """`repetitions` steps behind one name, as far as they fit."""
         window, now = self._window, self._now
-        slots = window.slots
-        at, stop = ends[0], len(slots)
+        place = ends[0]
+        column: Column | None = None
+        at = many = 0
         for _ in range(repetitions):
-            varbind = slots[at].varbind(now) if at < stop else None
+            varbind = column.varbind(at, now) if column is not None and at < many else None
             if varbind is None:
-                found = window.from_place(at + 1, now)
+                found = window.from_place(place, now)
                 if found is None:
-                    ends[0] = stop
-                    varbind = wire.varbind(name, wire.END_OF_MIB_VIEW)
+                    ends[0] = window.size
+                    varbind = wire.varbind(name if column is None else column.name(at - 1), wire.END_OF_MIB_VIEW)
                     if len(varbind) <= left:
                         out.append(varbind)
                     return
-                at, varbind = found
-            name = slots[at].name
+                place, varbind = found
+                number, at = window.locate(place)
+                column = window.columns[number]
+                many = column.size
             at += 1
-            ends[0] = at
+            place += 1
+            ends[0] = place
             left -= len(varbind)
             if left < 0:
                 return
@@ -115,18 +131,19 @@ class Reading:
     def _columns(self, names: list[bytes], places: list[int], repetitions: int, left: int, out: list[bytes]) -> None:
         """The same behind several names in turn."""
         window, now = self._window, self._now
-        slots, from_place = window.slots, window.from_place
+        from_place = window.from_place
         for _ in range(repetitions):
             ended = True
             for position, place in enumerate(places):
                 found = from_place(place, now)
                 if found is None:
                     varbind = wire.varbind(names[position], wire.END_OF_MIB_VIEW)
-                    places[position] = len(slots)
+                    places[position] = window.size
                 else:
                     at, varbind = found
                     places[position] = at + 1
-                    names[position] = slots[at].name
+                    number, at = window.locate(at)
+                    names[position] = window.columns[number].name(at)
                     ended = False
                 left -= len(varbind)
                 if left < 0:

@@ -38,7 +38,7 @@ class Single:
         self.grant = grant
         self.room = room
         self._size = size  # of the tail
-        self._frame = _RESULT + wire.head(0x30, size - 8) + wire.head(0x30, size - 10)
+        self._frame = _RESULT + wire.head(0x30, size - 8) + wire.head(0x30, size - 10) + wire.head(0x06, size - 14)
         self._head = head
         self._next = request.kind == reader.GET_NEXT
         self._id_size = len(request.request_id) - 2
@@ -50,20 +50,20 @@ class Single:
         tail = at + self._id_size
         if len(data) != tail + self._size or not data.startswith(self._frame, tail) or not data.endswith(_NULL):
             return None
-        place = window.places.get(data[tail + 10 : -2])
+        place = window.find(data[tail + 12 : -2])
         if place is None:
             return None
+        number, position = place
+        column = window.columns[number]
         if self._next:
-            place += 1
-            if place == len(window.slots):
-                return None
-            varbind = window.slots[place].varbind(now)
+            position += 1
+            varbind = column.varbind(position, now) if position < column.size else None
             if varbind is None:
                 window.refresh()
-                found = window.from_place(place + 1, now)
+                found = window.from_place(window.starts[number] + position, now)
                 varbind = found[1] if found is not None else None
         else:
-            varbind = window.slots[place].varbind(now)
+            varbind = column.varbind(position, now)
         if varbind is None:
             return None
         envelope = self._envelopes.get(len(varbind))

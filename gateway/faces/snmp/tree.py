@@ -1,11 +1,10 @@
-"""The site as a sorted list of OIDs with their varbinds.
+"""The site as columns of cells in the order of their OIDs.
 
-1. The list is made once, of every cell that could exist, so the order can never change between two requests of a walk.
-   GETNEXT is a look-up or a bisection, and a step over the cells that have no value now.
-2. A step is bounded: after LEAP_AFTER cells without a value, columns of points that no device shows are left out whole,
-   so that a site of silent devices costs one look at each device and each column.
-3. A varbind is encoded when it is first asked for and kept until what it shows changes: for ever for
-   configuration, with the device's snapshot for its values, not at all for clocks and counters.
+1. The columns and their rows are made once, of every cell that could exist, so the order can never change between two
+   requests of a walk. GETNEXT is a look-up or a bisection, and a step over the cells that have no value now.
+2. Places are numbers of cells in that order. A step is bounded: after LEAP_AFTER columns without a value, columns of
+   points that no device shows are left out whole, so that a site of silent devices costs one look at each device.
+3. How a cell is encoded, and how long that is kept, is the column's matter (`columns.py`).
 4. A view is a `Window`: a list in which everything else is missing. What is not in it cannot be found.
 5. One request is answered with one `now` and without giving up the event loop, so it sees one state of the site.
 """
@@ -13,16 +12,16 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import accumulate
 
 from gateway.core.site import Device
-from gateway.faces.snmp import wire
+from gateway.faces.snmp.columns import Cell, Column, Rows, column_of
 from gateway.faces.snmp.entity import entities
 from gateway.faces.snmp.layout import Layout
 from gateway.faces.snmp.objects import (
     CapabilityRow,
-    CellValue,
-    Changes,
     ConditionRow,
     DeviceRow,
     Gateway,
@@ -35,141 +34,113 @@ from gateway.faces.snmp.objects import (
 )
 from gateway.faces.snmp.settings import Oid, View
 
-LEAP_AFTER = 64
-
-_NEVER_ENCODED = object()
-_CONSTANT = object()
-
-
-class Slot:
-    """One cell that may exist, with its encoding of last time."""
-
-    __slots__ = (
-        "_cell",
-        "_device",
-        "_kept",
-        "_seen",
-        "_tag",
-        "_varbind",
-        "_wraps",
-        "name",
-        "object",
-        "oid",
-        "row",
-        "watched",
-    )
-
-    def __init__(self, oid: Oid, described: ObjectType, row: Row) -> None:
-        self.oid = oid
-        self.name = wire.object_identifier(oid)
-        self.object = described
-        self._tag = wire.TAGS[described.syntax]
-        self._wraps = described.syntax in wire.WRAPPING
-        self.row = row
-        device: Device | None = getattr(row, "device", None)
-        self._device = device if described.changes is Changes.WITH_SNAPSHOT else None
-        self._kept = described.changes is Changes.NEVER
-        self._seen: object = _NEVER_ENCODED
-        # What the cell depends on: a device's snapshot, nothing, or (None) what cannot be watched.
-        self.watched: object = _CONSTANT if self._kept else self._device
-        self._cell: CellValue = None
-        self._varbind: bytes | None = None
-
-    def varbind(self, now: float) -> bytes | None:
-        """The encoded varbind, or None when the cell has no value now."""
-        device = self._device
-        if device is not None:
-            snapshot = device.snapshot
-            if snapshot is not self._seen:
-                self._encode(now)
-                self._seen = snapshot
-        elif self._seen is not _CONSTANT:
-            self._encode(now)
-            if self._kept:
-                self._seen = _CONSTANT
-        return self._varbind
-
-    def _encode(self, now: float) -> None:
-        cell = self.object.get(self.row, now)
-        if cell == self._cell:
-            return
-        self._cell = cell
-        self._varbind = (
-            None if cell is None else wire.varbind(self.name, wire.tagged(self._tag, cell, wraps=self._wraps))
-        )
+LEAP_AFTER = 2
+_SCALAR: Oid = (0,)
 
 
 class Window:
     """The cells that one view shows of one tree, in order."""
 
-    def __init__(self, slots: Sequence[Slot], objects: frozenset[Oid], devices: Sequence[Device]) -> None:
-        """`slots` in order; `objects` are those of which noSuchInstance may be said."""
-        self.slots = tuple(slots)
-        self._oids = [slot.oid for slot in slots]
-        self.places = {slot.name: place for place, slot in enumerate(slots)}  # by encoded OID
+    def __init__(self, columns: Sequence[Column], objects: frozenset[Oid], devices: Sequence[Device]) -> None:
+        """`columns` in order, none of them empty; `objects` are those of which noSuchInstance may be said."""
+        self.columns = tuple(columns)
+        self.starts = [0, *accumulate(column.size for column in columns)]  # the last one is behind the end
+        self.size = self.starts[-1]
+        self._bases = [column.base for column in columns]
+        self._numbers = {column.prefix: number for number, column in enumerate(columns)}
+        # By how many octets a column is looked up, those of most cells first.
+        cells: Counter[int] = Counter()
+        for column in columns:
+            cells[len(column.prefix)] += column.size
+        self._sizes = [size for size, _ in cells.most_common()]
         self._objects = objects
         self._depths = sorted({len(oid) for oid in objects})
         self._devices = devices
-        self._shown: set[str] | None = None
-        self._columns: list[tuple[int, str | None]] = []  # (place of its first cell, point) of each column
-        described: ObjectType | None = None
-        for place, slot in enumerate(slots):
-            if slot.object is not described:
-                described = slot.object
-                self._columns.append((place, described.point))
+        self._next_shown: list[int] | None = None
 
-    def __iter__(self) -> Iterator[Slot]:
-        """Every slot in order, with a value or without."""
-        return iter(self.slots)
+    def __iter__(self) -> Iterator[Cell]:
+        """Every cell in order, with a value or without."""
+        return (cell for column in self.columns for cell in column)
 
     def refresh(self) -> None:
         """Forget what was remembered of the devices; called once at the beginning of a request."""
-        self._shown = None
+        self._next_shown = None
+
+    def find(self, content: bytes) -> tuple[int, int] | None:
+        """Number of the column, and position in it, of the cell whose OID has these octets; None when there is none."""
+        for size in self._sizes:
+            number = self._numbers.get(content[:size])
+            if number is not None:
+                at = self.columns[number].rows.places.get(content[size:])
+                return None if at is None else (number, at)
+        return None
 
     def get(self, oid: Oid, now: float) -> bytes | None:
         """The varbind of exactly this OID, or None."""
-        place = bisect_right(self._oids, oid) - 1
-        return self.slots[place].varbind(now) if place >= 0 and self._oids[place] == oid else None
+        place = self.place_after(oid) - 1
+        if place < 0:
+            return None
+        number, at = self.locate(place)
+        column = self.columns[number]
+        return column.varbind(at, now) if (*column.base, *column.rows.indexes[at]) == oid else None
 
     def after(self, oid: Oid, now: float) -> tuple[Oid, bytes] | None:
         """The first instantiated cell behind `oid` in lexicographic order, or None at the end."""
-        found = self.from_place(bisect_right(self._oids, oid), now)
-        return None if found is None else (self._oids[found[0]], found[1])
+        found = self.from_place(self.place_after(oid), now)
+        if found is None:
+            return None
+        number, at = self.locate(found[0])
+        column = self.columns[number]
+        return (*column.base, *column.rows.indexes[at]), found[1]
 
     def place_after(self, oid: Oid) -> int:
         """The place of the first cell behind `oid`."""
-        return bisect_right(self._oids, oid)
+        number = bisect_right(self._bases, oid) - 1
+        if number < 0:
+            return 0
+        base = self._bases[number]
+        depth = len(base)
+        if oid[:depth] != base:
+            return self.starts[number + 1]
+        return self.starts[number] + bisect_right(self.columns[number].rows.indexes, oid[depth:])
+
+    def locate(self, place: int) -> tuple[int, int]:
+        """Number of the column, and position in it, of a place before the end."""
+        number = bisect_right(self.starts, place) - 1
+        return number, place - self.starts[number]
 
     def from_place(self, place: int, now: float) -> tuple[int, bytes] | None:
         """The first instantiated cell at `place` or behind it with its place, or None at the end."""
-        slots = self.slots
-        for at in range(place, min(place + LEAP_AFTER, len(slots))):
-            varbind = slots[at].varbind(now)
-            if varbind is not None:
-                return at, varbind
-        return self._leap(place + LEAP_AFTER, now)
+        if place >= self.size:
+            return None
+        columns = self.columns
+        number, at = self.locate(place)
+        until = number + LEAP_AFTER
+        while number < len(columns):
+            found = columns[number].first(at, now)
+            if found is not None:
+                return self.starts[number] + found[0], found[1]
+            number, at = number + 1, 0
+            if number >= until:
+                number = self._leap(number)
+        return None
 
     def has_object(self, oid: Oid) -> bool:
         """Whether `oid` lies in an object that the agent implements, instantiated or not (RFC 3416 §4.2.1)."""
         return any(oid[:depth] in self._objects for depth in self._depths)
 
-    def _leap(self, place: int, now: float) -> tuple[int, bytes] | None:
-        slots, columns = self.slots, self._columns
-        if place >= len(slots):
-            return None
-        if self._shown is None:
-            self._shown = set().union(*(device.snapshot.shown() for device in self._devices))
-        column = bisect_right(columns, place, key=lambda each: each[0]) - 1
-        for number in range(column, len(columns)):
-            first, point = columns[number]
-            if point is not None and point not in self._shown:
-                continue
-            end = columns[number + 1][0] if number + 1 < len(columns) else len(slots)
-            for at in range(max(first, place), end):
-                varbind = slots[at].varbind(now)
-                if varbind is not None:
-                    return at, varbind
-        return None
+    def _leap(self, number: int) -> int:
+        """The first column from this one on that is not of a point that no device shows."""
+        if self._next_shown is None:
+            shown: set[str] = set().union(*(device.snapshot.shown() for device in self._devices))
+            ahead = len(self.columns)
+            found = [ahead]
+            for at in range(len(self.columns) - 1, -1, -1):
+                point = self.columns[at].object.point
+                ahead = at if point is None or point in shown else ahead
+                found.append(ahead)
+            self._next_shown = found[::-1]
+        return self._next_shown[number]
 
 
 class Tree(Window):
@@ -179,33 +150,56 @@ class Tree(Window):
         self, gateway: Gateway, groups: Sequence[ScalarGroup], tables: Sequence[Table], single: Row | None = None
     ) -> None:
         """`single` is what the scalars are of, when not of the gateway."""
-        cells: list[tuple[Oid, ObjectType, Row]] = [
-            ((*group.base, described.number, 0), described, gateway if single is None else single)
+        alone = Rows([(_SCALAR, gateway if single is None else single)])
+        columns = [
+            column_of((*group.base, described.number), described, alone)
             for group in groups
             for described in group.objects
         ]
+        made: dict[RowKind, Rows] = {}
         for table in tables:
-            for index, row in _ROWS[table.rows](gateway):
-                cells += [
-                    ((*table.base, 1, column.number, *index), column, row)
-                    for column in table.columns
-                    if (column.models is None or _model(row) in column.models)
-                    and (column.only is None or column.only(row))
-                ]
-        cells.sort(key=lambda cell: cell[0])
-        # Made in the order of a walk, so that neighbours in it are neighbours in memory.
-        slots = [Slot(*cell) for cell in cells]
+            if table.rows not in made:
+                made[table.rows] = Rows(_ROWS[table.rows](gateway))
+            columns += _columns(table, made[table.rows])
+        columns.sort(key=lambda column: column.base)
         objects = frozenset((*group.base, each.number) for group in groups for each in group.objects) | frozenset(
             (*table.base, 1, column.number) for table in tables for column in table.columns
         )
-        super().__init__(slots, objects, gateway.site.devices)
+        super().__init__(columns, objects, gateway.site.devices)
 
     def window(self, view: View) -> Window:
         """What `view` shows of the tree."""
-        slots = [slot for slot in self.slots if view.shows(slot.oid)]
-        if len(slots) == len(self.slots):
+        columns = [shown for column in self.columns if (shown := _shown_of(column, view)) is not None]
+        if len(columns) == len(self.columns) and all(map(lambda a, b: a is b, columns, self.columns)):
             return self
-        return Window(slots, frozenset(oid for oid in self._objects if view.shows(oid)), self._devices)
+        return Window(columns, frozenset(oid for oid in self._objects if view.shows(oid)), self._devices)
+
+
+def _columns(table: Table, rows: Rows) -> Iterator[Column]:
+    """The columns of a table, each with those of its rows that have it; one that no row has is left out."""
+    chosen: dict[object, Rows] = {}
+    for described in table.columns:
+        key = described.models, described.only
+        if key not in chosen:
+            having = [at for at, row in enumerate(rows.rows) if _has(described, row)]
+            chosen[key] = rows if len(having) == rows.size else rows.only(having)
+        if chosen[key].size:
+            yield column_of((*table.base, 1, described.number), described, chosen[key])
+
+
+def _has(described: ObjectType, row: Row) -> bool:
+    return (described.models is None or _model(row) in described.models) and (
+        described.only is None or described.only(row)
+    )
+
+
+def _shown_of(column: Column, view: View) -> Column | None:
+    """What a view shows of a column; None: nothing."""
+    base, indexes = column.base, column.rows.indexes
+    if not any(len(each) > len(base) and each[: len(base)] == base for each in (*view.include, *view.exclude)):
+        return column if view.shows(base) else None
+    having = [at for at, index in enumerate(indexes) if view.shows((*base, *index))]
+    return column_of(base, column.object, column.rows.only(having)) if having else None
 
 
 def whole(layout: Layout, gateway: Gateway, groups: Sequence[ScalarGroup], tables: Sequence[Table]) -> Tree:
@@ -213,11 +207,11 @@ def whole(layout: Layout, gateway: Gateway, groups: Sequence[ScalarGroup], table
     return Tree(gateway, (*groups, *layout.groups), (*tables, *layout.tables))
 
 
-Rows = list[tuple[Oid, Row]]
+Found = list[tuple[Oid, Row]]
 """Rows with the arcs of their index."""
 
 
-def _conditions(gateway: Gateway) -> Rows:
+def _conditions(gateway: Gateway) -> Found:
     conditions = gateway.conditions
     if conditions is None:
         return []
@@ -227,7 +221,7 @@ def _conditions(gateway: Gateway) -> Rows:
     ]
 
 
-_ROWS: Mapping[RowKind, Callable[[Gateway], Rows]] = {
+_ROWS: Mapping[RowKind, Callable[[Gateway], Found]] = {
     RowKind.LINE: lambda gateway: [((line.index,), LineRow(gateway, line)) for line in gateway.site.lines],
     RowKind.DEVICE: lambda gateway: [((each.unit_id,), DeviceRow(gateway, each)) for each in gateway.site.devices],
     RowKind.CONDITION: _conditions,

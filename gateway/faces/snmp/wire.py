@@ -59,15 +59,20 @@ def integer(tag: int, value: int) -> bytes:
 
 def object_identifier(oid: Oid) -> bytes:
     """An OID of two arcs or more."""
+    return tlv(0x06, arcs((oid[0] * 40 + oid[1], *oid[2:])))
+
+
+def arcs(numbers: Oid) -> bytes:
+    """The octets of arcs within an OID, the first two of which are one number (X.690 §8.19.4)."""
     content = bytearray()
-    for arc in (oid[0] * 40 + oid[1], *oid[2:]):
+    for arc in numbers:
         piece = [arc & 0x7F]
         rest = arc >> 7
         while rest:
             piece.append(0x80 | rest & 0x7F)
             rest >>= 7
         content += bytes(reversed(piece))
-    return tlv(0x06, bytes(content))
+    return bytes(content)
 
 
 def value(syntax: Syntax, cell: CellValue) -> bytes:
