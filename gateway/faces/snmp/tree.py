@@ -3,7 +3,8 @@
 1. The columns and their rows are made once, of every cell that could exist, so the order can never change between two
    requests of a walk. GETNEXT is a look-up or a bisection, and a step over the cells that have no value now.
 2. Places are numbers of cells in that order. A step is bounded: after LEAP_AFTER columns without a value, columns of
-   points that no device shows are left out whole, so that a site of silent devices costs one look at each device.
+   points that no device shows are left out whole, for the rest of the request, so that a site of silent devices costs
+   one look at each device.
 3. How a cell is encoded, and how long that is kept, is the column's matter (`columns.py`).
 4. A view is a `Window`: a list in which everything else is missing. What is not in it cannot be found.
 5. One request is answered with one `now` and without giving up the event loop, so it sees one state of the site.
@@ -116,14 +117,16 @@ class Window:
         columns = self.columns
         number, at = self.locate(place)
         until = number + LEAP_AFTER
-        while number < len(columns):
+        while True:
+            if number >= until or self._next_shown is not None:
+                ahead = self._leap(number)
+                number, at = ahead, at if ahead == number else 0
+            if number == len(columns):
+                return None
             found = columns[number].first(at, now)
             if found is not None:
                 return self.starts[number] + found[0], found[1]
             number, at = number + 1, 0
-            if number >= until:
-                number = self._leap(number)
-        return None
 
     def has_object(self, oid: Oid) -> bool:
         """Whether `oid` lies in an object that the agent implements, instantiated or not (RFC 3416 §4.2.1)."""

@@ -25,7 +25,7 @@ from tests.faces.snmp.test_responder import LIVE, LOCAL, Reply, request
 
 UNITS = 200
 OCTETS_A_CELL = 120
-MOST_READ = 10 * UNITS
+MOST_READ = 7 * UNITS
 """Cells whose value one datagram may read: those of its reply, and those of a few columns that were stepped over."""
 
 
