@@ -16,6 +16,7 @@ from gateway.generate.registers import register_outputs
 from gateway.generate.rules import rule_outputs
 from gateway.generate.snmp_exporter import exporter_outputs
 from gateway.generate.telegraf import telegraf_outputs
+from gateway.generate.zabbix import zabbix_outputs
 
 
 def outputs() -> dict[str, str]:
@@ -30,6 +31,7 @@ def outputs() -> dict[str, str]:
         exporter_outputs(),
         librenms_outputs(),
         telegraf_outputs(),
+        zabbix_outputs(),
     ):
         for path, text in part.items():
             if path in made:
