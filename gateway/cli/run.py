@@ -41,5 +41,5 @@ def command(
         if not mine:
             print(f"{config}: another gateway uses the state_dir {checked.state_dir}", file=sys.stderr)
             raise typer.Exit(1)
-        if status := serve(checked, make_loop):
+        if status := serve(config, checked, make_loop):
             raise typer.Exit(status)

@@ -10,7 +10,7 @@ Rule 2: a request costs one token of its client. Tokens are taken from the bucke
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from gateway.core.ratelimit import Bucket, ClientRate
 from gateway.core.stats import ModbusServerStats
@@ -63,6 +63,14 @@ class Client:
         self.exceptions: Counter[int] = Counter()  # all exceptions it was given, by code
         self.pause_s = 0.0  # how long nothing shall be read from it, for who asks next to take
 
+    def limit(self, rate: ClientRate, burst_s: float, now: float) -> None:
+        """Another rate from now on, with full buckets; what was leased and not used is given back."""
+        self.bucket = Bucket(rate.requests_per_s, burst_s, now)
+        self.line_bucket = Bucket(rate.line_per_s, burst_s, now)
+        self._size = LEASE if rate.requests_per_s else _UNLIMITED
+        self._granted -= self.left
+        self.left = 0
+
     @property
     def requests(self) -> int:
         """What it asked."""
@@ -113,6 +121,12 @@ class ClientTable:
         client.open_connections += 1
         client.last_seen = now
         return client
+
+    def limit(self, rate_of: Callable[[str], ClientRate], burst_s: float, now: float) -> None:
+        """Other rates from now on, for those that are known too."""
+        self._burst_s = burst_s
+        for client in self._clients.values():
+            client.limit(rate_of(client.name), burst_s, now)
 
     def left(self, client: Client, last_seen: float) -> None:
         """A connection of this client is over."""

@@ -253,6 +253,16 @@ class GatewayConditions(_Set):
             self._add(line_condition(line.index), now, line=line)
         self._raised_since: dict[int, float] = {}
 
+    def go_on(self, before: GatewayConditions) -> None:
+        """Take over what is known of the same conditions: of the gateway itself, and of lines that stayed."""
+        self._raised_since = before._raised_since
+        for code, watch in before.by_code.items():
+            mine = self.by_code.get(code)
+            if mine is not None and mine.line is watch.line:
+                self.by_code[code] = watch
+                if watch.state is ConditionState.RAISED:
+                    self._active[watch.condition.severity] += 1
+
     def line_is(self, index: int, state: LineState, since: float, now: float) -> None:
         """Learn the state of a line, and since when it has it."""
         down_long = state is LineState.DOWN and now - since >= DOWN_S
@@ -279,12 +289,19 @@ class GatewayConditions(_Set):
 class Conditions:
     """All conditions of a site; `own` are those of the gateway itself, which are told by `gateway.tell`."""
 
-    def __init__(self, site: Site, own: Sequence[Condition], now: float) -> None:
-        self._changed: dict[Watch, None] = {}
+    def __init__(self, site: Site, own: Sequence[Condition], now: float, before: Conditions | None = None) -> None:
+        """With those of `before`, as far as their devices and lines are still there."""
+        self._changed: dict[Watch, None] = {} if before is None else before._changed  # noqa: SLF001 - its own kind
         self._lines = site.lines
         self.gateway = GatewayConditions(site.lines, own, now, self._changed)
+        known = {} if before is None else before.devices
+        if before is not None:
+            self.gateway.go_on(before.gateway)
         self.devices: Mapping[int, DeviceConditions] = {
-            device.unit_id: DeviceConditions(device, now, self._changed) for device in site.devices
+            device.unit_id: known[device.unit_id]
+            if device.unit_id in known and known[device.unit_id].device is device
+            else DeviceConditions(device, now, self._changed)
+            for device in site.devices
         }
 
     def look(self, now: float) -> None:

@@ -186,6 +186,12 @@ class LineEngine:
         """Whether a transaction is on the wire."""
         return self._turn is not None
 
+    def adjust(self, settings: LineSettings, now: float) -> None:
+        """Go on by other settings of the same wire (`LineSettings.same_wire`)."""
+        self.settings = settings
+        self._polling.adjust(settings, self._records.values(), now)
+        self._scheduler.adjust(limit=settings.queue_limit, limit_s=settings.queue_limit_s)
+
     def finish(self) -> None:
         """Begin nothing more (rule 9)."""
         self._finishing = True

@@ -46,6 +46,11 @@ class FairQueue:
     def __len__(self) -> int:
         return len(self._waiting)
 
+    def adjust(self, *, limit: int, limit_s: float) -> None:
+        """Other limits from now on; who waits already is not turned away by the new `limit`."""
+        self._limit = limit
+        self._limit_s = limit_s
+
     def add(self, device: Device, pdu: bytes, span: Span | None, waiter: Waiter) -> ClientRead | None:
         """Queue a read or join an identical one; raises QueueFull (rule 4).
 

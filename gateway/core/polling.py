@@ -16,6 +16,7 @@ Rule 5: a value that must be written again and again is warned about after three
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 
 from gateway.core.device_record import DeviceRecord
 from gateway.core.health import MISSES_TO_OPEN
@@ -41,6 +42,15 @@ class Polling:
 
     def __init__(self, settings: LineSettings) -> None:
         self._settings = settings
+
+    def adjust(self, settings: LineSettings, records: Iterable[DeviceRecord], now: float) -> None:
+        """Poll by other settings from now on; what is wanted more often is not waited for longer than that."""
+        self._settings = settings
+        period_s = {PollClass.LIVE: settings.poll.live_s, PollClass.SETTINGS: settings.poll.settings_s}
+        for item in (item for record in records for item in record.polls.items):
+            if item.block is not None:
+                item.period_s = period_s[item.block.poll]
+                item.due = min(item.due, now + item.period_s)
 
     def first(self, device: Device, now: float) -> list[PollItem]:
         """The plan, and what is asked once."""

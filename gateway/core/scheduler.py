@@ -81,6 +81,12 @@ class Scheduler:
     def __len__(self) -> int:
         return len(self._clients) + len(self._background) + sum(map(len, self._writes.values()))
 
+    def adjust(self, *, limit: int, limit_s: float) -> None:
+        """Other limits from now on."""
+        self._limit = limit
+        self._clients.adjust(limit=limit, limit_s=limit_s)
+        self._background.adjust(limit=limit, limit_s=float("inf"))
+
     def add_read(self, device: Device, pdu: bytes, span: Span | None, waiter: Waiter, lane: Lane) -> ClientRead | None:
         """Queue a read; see FairQueue.add."""
         return self._queue(lane).add(device, pdu, span, waiter)

@@ -36,6 +36,19 @@ class LineSettings:
     writes: bool = False  # whether this line ever sends a write
     poll: PollSettings = PollSettings()
 
+    def same_wire(self, other: LineSettings) -> bool:
+        """Whether a line that runs by these can go on by the others without its port being opened anew."""
+        return self == replace(
+            other,
+            index=self.index,
+            reply_timeout_s=self.reply_timeout_s,
+            retries=self.retries,
+            queue_limit=self.queue_limit,
+            queue_limit_s=self.queue_limit_s,
+            writes=self.writes,
+            poll=self.poll,
+        )
+
     def timing(self) -> Timing:
         """Wire times at this speed; the gap is the configured one where that is longer than 3.5 characters."""
         timing = Timing.of(self.baudrate, self.bytesize, self.parity, self.stopbits)

@@ -96,6 +96,16 @@ class NotifyStats:
 
 
 @dataclass(slots=True)
+class ServiceStats:
+    """The process since start."""
+
+    reloads: Counter[str] = field(default_factory=Counter)  # what became of it → count
+    reload_works: bool = True  # whether the file was right when it was last read
+    configured_at: float = 0.0  # wall time at which the configuration in use was taken
+    restarts: Counter[str] = field(default_factory=Counter)  # task → how often a bug ended it
+
+
+@dataclass(slots=True)
 class DeviceHistoryStats:
     """The daily log of one device: what is stored of the controller that is there now, and the harvests since start."""
 

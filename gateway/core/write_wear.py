@@ -36,6 +36,10 @@ class Wear:
         self._last: dict[Cell, float] = {}
         self._worn: dict[Cell, list[float]] = {}  # the last `per_day` writes, oldest first
 
+    def limit(self, limits: WearLimits) -> None:
+        """Other limits from now on; what was written before counts."""
+        self._limits = limits
+
     def check(self, cell: Cell, now: float, *, wears: bool) -> None:
         """Raise WriteTooSoon or WriteBudgetSpent when a write at `now` would be one too many."""
         last = self._last.get(cell)

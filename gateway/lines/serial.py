@@ -109,6 +109,12 @@ class SerialLine:
         self._wake_up()
         return ticket
 
+    def adjust(self, settings: LineSettings) -> None:
+        """Go on by other settings of the same wire; the port stays open and what is under way is not disturbed."""
+        self.settings = settings
+        self._engine.adjust(settings, self._clock.monotonic())
+        self._wake_up()
+
     def overdue_s(self, now: float) -> float:
         """How long the engine has had something to do and was not let; 0 while the port is not open."""
         if self._port is None or self._engine.next_deadline(now) is None:

@@ -58,16 +58,26 @@ class ConditionKeeper:
         state_dir: Path,
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> None:
-        own: list[Condition] = [STATE_DIR, NOT_READY]
-        if history is not None:
-            own.insert(0, HISTORY_DOWN)
-        self.conditions = Conditions(site, own, clock.monotonic())
+        self.conditions = self.of(site, history, clock.monotonic())
         self.told: Told | None = None
         self._clock = clock
         self._not_ready = not_ready
         self._history = history
         self._state_dir = state_dir
         self._sleep = sleep
+
+    @staticmethod
+    def of(site: Site, history: HistoryStats | None, now: float, before: Conditions | None = None) -> Conditions:
+        """The conditions of a site; `history` None where none is kept."""
+        own: list[Condition] = [STATE_DIR, NOT_READY]
+        if history is not None:
+            own.insert(0, HISTORY_DOWN)
+        return Conditions(site, own, now, before)
+
+    def adjust(self, conditions: Conditions, history: HistoryStats | None) -> None:
+        """Keep these from now on."""
+        self.conditions = conditions
+        self._history = history
 
     async def run(self) -> None:
         """Look again and again."""

@@ -1,19 +1,24 @@
-"""The gateway put together: lines, devices, faces, history, one supervisor.
+"""The gateway put together: lines, devices, faces, history, one supervisor; and put together anew at work.
 
 Nothing is opened while it is built; a mistake here is a bad configuration or a bug, never a busy port. Its life
-from start to signal is service/process.py's.
+from start to signal is service/process.py's; how it comes to another configuration, service/reload.py's.
 """
 
 from __future__ import annotations
 
 import asyncio
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 
 from gateway.clock import Clock
+from gateway.core.conditions import Conditions, Watch
 from gateway.core.site import Site
-from gateway.core.stats import HistoryStats, ModbusServerStats
+from gateway.core.stats import HistoryStats, ModbusServerStats, ServiceStats
+from gateway.errors import ConfigError, ListenError, TlsFilesError
+from gateway.faces.http.access import Access, tls_context
 from gateway.faces.http.app import HttpFace
 from gateway.faces.modbus.server import ModbusServer
+from gateway.faces.modbus.tls_files import Credentials, load
 from gateway.faces.snmp.agent import SnmpAgent
 from gateway.history.keeper import HistoryKeeper
 from gateway.history.source import HistorySource
@@ -21,59 +26,99 @@ from gateway.lines.serial import SerialLine
 from gateway.service.conditions import ConditionKeeper
 from gateway.service.config import Config
 from gateway.service.parts import Listener, Runnable
-from gateway.service.settings import (
-    history_settings,
-    http_settings,
-    line_devices,
-    line_settings,
-    modbus_settings,
-)
+from gateway.service.settings import history_settings, http_settings, modbus_settings
 from gateway.service.snmp import snmp_settings
+from gateway.service.south import South
 from gateway.service.supervisor import Supervisor
 from gateway.service.systemd import Systemd
+from gateway.service.tls import tls_settings
 from gateway.service.watchdog import Watchdog
 
 
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Another configuration, read, checked and built."""
+
+    config: Config
+    south: South
+    conditions: Conditions
+    history: HistoryStats | None
+    snmp: SnmpAgent | None  # None: as before
+    access: Access
+    tls: Credentials | None
+
+
 class Gateway:
-    """All parts of one configuration."""
+    """All parts of one configuration, and of the next."""
 
     def __init__(self, config: Config, clock: Clock, systemd: Systemd | None = None) -> None:
-        groups = [line_devices(line) for line in config.line]
-        self.lines = tuple(
-            SerialLine(settings, devices, clock)
-            for settings, devices in zip(line_settings(config), groups, strict=True)
-        )
-        self.site = Site.of(config.site, self.lines, [device for group in groups for device in group])
-        stats = ModbusServerStats()
-        self._modbus = modbus = ModbusServer(modbus_settings(config), self.site, clock, stats)
-        history = HistoryStats() if config.history.enabled else None
+        self.config = config
+        self._clock = clock
+        self._south = south = South.of(config, clock)
+        self.stats = ServiceStats(configured_at=clock.wall())
+        self._modbus_stats = ModbusServerStats()
+        self._modbus = ModbusServer(modbus_settings(config), self.site, clock, self._modbus_stats)
+        self._history = HistoryStats() if config.history.enabled else None
         kept = history_settings(config)
-        watching = ConditionKeeper(
-            self.site, clock, not_ready=self.not_ready, history=history, state_dir=kept.directory
+        self._watching = ConditionKeeper(
+            self.site, clock, not_ready=self.not_ready, history=self._history, state_dir=kept.directory
         )
-        self.conditions = watching.conditions
-        snmp = SnmpAgent(snmp_settings(config), self.site, clock, stats, conditions=self.conditions)
-        http = HttpFace(
+        self._snmp_settings = snmp_settings(config)
+        self._snmp = SnmpAgent(
+            self._snmp_settings, self.site, clock, self._modbus_stats, conditions=self._watching.conditions
+        )
+        self._http = HttpFace(
             http_settings(config),
             self.site,
             clock,
-            modbus=stats,
-            snmp=lambda: asdict(snmp.counters),
+            modbus=self._modbus_stats,
+            snmp=lambda: asdict(self._snmp.counters),
             not_ready=self.not_ready,
-            history=history,
-            log=None if history is None else HistorySource(kept.directory, config.site),
-            clients=modbus.clients,
+            history=self._history,
+            log=self._log(config),
+            clients=self._modbus.clients,
             conditions=self.conditions,
-            notifications=snmp.notifier.stats,
+            notifications=self._snmp.notifier.stats,
+            service=self.stats,
         )
-        harvesting = () if history is None else (HistoryKeeper(kept, self.site, clock, history),)
-        watching.told = snmp.notifier.changed
-        notifying = (snmp.notifier,) if snmp.notifier.stats else ()
-        self.keepers: tuple[Runnable, ...] = (watching, *harvesting, *notifying)
+        self._watching.told = self._tell
+        self._harvesting = self._harvester(config, self.site)
+        self._others: tuple[Runnable, ...] = ()
         if systemd is not None and systemd.watchdog_s is not None:
-            self.keepers += (Watchdog(systemd, systemd.watchdog_s, self.stuck),)
-        self.listeners: tuple[Listener, ...] = (*modbus.listeners, *snmp.listeners, *http.listeners)
-        self.supervisor = Supervisor(clock, self.lines, self.listeners, self.keepers)
+            self._others = (Watchdog(systemd, systemd.watchdog_s, self.stuck),)
+        self.supervisor = Supervisor(clock, south.lines, self.listeners, self.keepers)
+        self.stats.restarts = self.supervisor.restarts
+
+    @property
+    def lines(self) -> tuple[SerialLine, ...]:
+        """The lines, in the order of the file."""
+        return self._south.lines
+
+    @property
+    def site(self) -> Site:
+        """Lines and devices as the faces see them."""
+        return self._south.site
+
+    @property
+    def conditions(self) -> Conditions:
+        """Everything that can be wrong."""
+        return self._watching.conditions
+
+    @property
+    def listeners(self) -> tuple[Listener, ...]:
+        """Every address of every face."""
+        return (*self._modbus.listeners, *self._snmp.listeners, *self._http.listeners)
+
+    @property
+    def keepers(self) -> tuple[Runnable, ...]:
+        """What runs beside lines and listeners."""
+        notifier = self._snmp.notifier
+        return (self._watching, *self._harvesting, *((notifier,) if notifier.stats else ()), *self._others)
+
+    def keep(self, keeper: Runnable) -> None:
+        """Have one more keeper; before `run`."""
+        self._others += (keeper,)
+        self.supervisor.keep(keeper)
 
     def not_ready(self) -> tuple[str, ...]:
         """Why the gateway does not do what its configuration says: listeners not open, files that cannot be used."""
@@ -83,15 +128,89 @@ class Gateway:
             closed if tls is None or not tls.problem else (*closed, f"modbus tls cannot use its files: {tls.problem}")
         )
 
+    def summary(self) -> str:
+        """In a few words for people: is it ready?"""
+        closed = len(self.supervisor.down())
+        return f"{closed} listeners are not open" if closed else "serving"
+
     def stuck(self, most_s: float) -> tuple[str, ...]:
         """See `Supervisor.stuck`."""
         return self.supervisor.stuck(most_s)
 
-    def reload(self) -> None:
-        """Take certificates, keys and CRLs as they are on disk now, or keep the old ones."""
-        if self._modbus.door is not None:
-            self._modbus.door.reload()
-
     async def run(self, stop: asyncio.Event) -> None:
         """Work until `stop` is set."""
         await self.supervisor.run(stop)
+
+    async def plan(self, config: Config) -> Plan:
+        """Build what another configuration wants; nothing is touched. ConfigError when it cannot be had."""
+        south = await asyncio.to_thread(South.of, config, self._clock, self._south)
+        history = (self._history or HistoryStats()) if config.history.enabled else None
+        conditions = self.conditions
+        if south.site is not self.site or (history is None) is not (self._history is None):
+            conditions = ConditionKeeper.of(south.site, history, self._clock.monotonic(), conditions)
+        return await asyncio.to_thread(self._plan, config, south, history, conditions)
+
+    def _plan(self, config: Config, south: South, history: HistoryStats | None, conditions: Conditions) -> Plan:
+        problems: list[str] = []
+        access, tls, agent = Access(), None, None
+        try:
+            access = Access.read(http_settings(config))
+            tls_context(http_settings(config))
+        except ListenError as error:
+            problems.append(f"http: {error}")
+        tls_wanted = tls_settings(config)
+        try:
+            tls = None if tls_wanted is None else load(tls_wanted.files, self._clock.wall())
+        except TlsFilesError as error:
+            self._modbus.files_unusable(str(error))
+            problems += [f"modbus.tls.{key}: {text}" for key, text in error.problems]
+        try:
+            settings = snmp_settings(config)
+        except ConfigError as error:
+            problems += error.problems
+        else:
+            if settings != self._snmp_settings or conditions is not self.conditions:
+                agent = SnmpAgent(
+                    settings, south.site, self._clock, self._modbus_stats, conditions=conditions, before=self._snmp
+                )
+        if problems:
+            raise ConfigError(tuple(problems))
+        return Plan(config, south, conditions, history, agent, access, tls)
+
+    async def change(self, plan: Plan) -> None:
+        """Come to another configuration: a step that nobody sees half of; then what goes stops, what comes is tried."""
+        config, south = plan.config, plan.south
+        before, self._south = self._south, south
+        same_log = config.history == self.config.history and south.site is before.site
+        self.config, self._history = config, plan.history
+        south.adjust_lines(before)
+        self._watching.adjust(plan.conditions, plan.history)
+        self._modbus.adjust(modbus_settings(config), south.site, plan.tls)
+        if plan.snmp is not None:
+            self._snmp_settings = plan.snmp.settings
+            self._snmp.adjust(plan.snmp)
+            self._tell(tuple(plan.conditions.active()), self._clock.monotonic())  # receivers that are new know nothing
+        self._http.adjust(
+            http_settings(config),
+            plan.access,
+            south.site,
+            history=plan.history,
+            log=self._log(config),
+            conditions=plan.conditions,
+            notifications=self._snmp.notifier.stats,
+        )
+        if not same_log:
+            self._harvesting = self._harvester(config, south.site)
+        await self.supervisor.change(south.lines, self.listeners, self.keepers)
+        await self.supervisor.settled()
+
+    def _tell(self, watches: Sequence[Watch], now: float) -> None:
+        self._snmp.notifier.changed(watches, now)
+
+    def _log(self, config: Config) -> HistorySource | None:
+        return HistorySource(history_settings(config).directory, config.site) if config.history.enabled else None
+
+    def _harvester(self, config: Config, site: Site) -> tuple[HistoryKeeper, ...]:
+        if self._history is None:
+            return ()
+        return (HistoryKeeper(history_settings(config), site, self._clock, self._history),)

@@ -4,7 +4,7 @@ Rule 1: the first SIGTERM or SIGINT stops in order (service/supervisor.py), the 
         Both leave exit status 0, also while it starts.
 Rule 2: when a part fails again and again, the gateway stops in the same order and leaves exit status 70, upon which
         systemd starts it anew.
-Rule 3: SIGHUP has the files of Modbus/TCP Security read again (faces/modbus/tls.py). The configuration is read once.
+Rule 3: SIGHUP has the configuration read again, and every file that it names (service/reload.py).
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ import logging
 import os
 import signal
 from collections.abc import Callable
+from pathlib import Path
 
 from gateway import __version__
 from gateway.clock import SystemClock
 from gateway.service.advice import advice
 from gateway.service.config import Config
 from gateway.service.gateway import Gateway
+from gateway.service.reload import Reloader
 from gateway.service.settings import line_budgets
 from gateway.service.systemd import Systemd
 
@@ -29,20 +31,23 @@ EX_SOFTWARE = 70
 _log = logging.getLogger(__name__)
 
 
-def serve(config: Config, make_loop: Callable[[], asyncio.AbstractEventLoop]) -> int:
-    """Run the gateway until a signal stops it; the exit status."""
+def serve(path: Path, config: Config, make_loop: Callable[[], asyncio.AbstractEventLoop]) -> int:
+    """Run the gateway until a signal stops it; the exit status. `config` is what the file at `path` held."""
     with asyncio.Runner(loop_factory=make_loop) as runner:
-        return runner.run(_serve(config))
+        return runner.run(_serve(path, config))
 
 
-async def _serve(config: Config) -> int:
+async def _serve(path: Path, config: Config) -> int:
     running = asyncio.get_running_loop()
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         running.add_signal_handler(number, _stopper(number, stop))
     systemd = Systemd(os.environ)
-    gateway = Gateway(config, SystemClock(), systemd)
-    running.add_signal_handler(signal.SIGHUP, gateway.reload)
+    clock = SystemClock()
+    gateway = Gateway(config, clock, systemd)
+    reloader = Reloader(path, gateway, clock, systemd)
+    gateway.keep(reloader)
+    running.add_signal_handler(signal.SIGHUP, reloader.wanted)
     for text in advice(config, line_budgets(config)):
         _log.warning('event=advice text="%s"', text.replace('"', "'"))
     _log.info(
@@ -68,8 +73,7 @@ async def _serve(config: Config) -> int:
 async def _announce(gateway: Gateway, systemd: Systemd) -> None:
     """Say that the start is over: everything that listens does so, or was tried."""
     await gateway.supervisor.settled()
-    closed = gateway.supervisor.down()
-    systemd.ready(f"{len(closed)} listeners are not open" if closed else "serving")
+    systemd.ready(gateway.summary())
 
 
 async def _farewell(stop: asyncio.Event, systemd: Systemd) -> None:

@@ -68,6 +68,10 @@ class Supervisor:
         """The labels of the listeners that are not open; none means ready, whatever lines and controllers do."""
         return tuple(listener.label for listener in self._listeners if listener not in self._up)
 
+    def keep(self, keeper: Runnable) -> None:
+        """Have one more keeper; before `run`."""
+        self._keepers[keeper] = None
+
     async def settled(self) -> None:
         """Wait until every listener is open, or was tried."""
         while not self._tried >= self._listeners.keys():
@@ -92,30 +96,29 @@ class Supervisor:
         finally:
             told.cancel()
             over.cancel()
-            await self._stop(tuple(self._lines), tuple(self._keepers), tuple(self._listeners))
+            self._over.set()  # a change that is under way starts nothing more
+            lines, keepers, listeners = self._lines.values(), self._keepers.values(), self._listeners.values()
+            await self._stop(tuple(self._lines), _tasks(lines), _tasks(keepers), _tasks(listeners))
 
-    async def change(
-        self,
-        lines: Sequence[Line],
-        listeners: Sequence[Listener],
-        keepers: Sequence[Runnable],
-        turn: Callable[[], None],
-    ) -> None:
-        """Have exactly these from now on (rule 5). `turn` is called when what goes has stopped, before the new begin.
-
-        The address or port of a part that goes can be had by one that comes.
-        """
-        await self._stop(
-            [line for line in self._lines if line not in lines],
-            [keeper for keeper in self._keepers if keeper not in keepers],
-            [listener for listener in self._listeners if listener not in listeners],
-        )
-        turn()
+    async def change(self, lines: Sequence[Line], listeners: Sequence[Listener], keepers: Sequence[Runnable]) -> None:
+        """Have exactly these from now on (rule 5); one that comes can have the address or port of one that goes."""
+        gone = [line for line in self._lines if line not in lines]
+        running = _tasks(self._lines[line] for line in gone)
+        keeping = _tasks(task for keeper, task in self._keepers.items() if keeper not in keepers)
+        listening = _tasks(task for listener, task in self._listeners.items() if listener not in listeners)
         self._lines = {line: self._lines.get(line) for line in lines}
         self._keepers = {keeper: self._keepers.get(keeper) for keeper in keepers}
         self._listeners = {listener: self._listeners.get(listener) for listener in listeners}
         self._tried &= self._listeners.keys()
-        self._start()
+        await self._stop(gone, running, keeping, listening)
+        if not self._over.is_set():
+            self._start()
+
+    def give_up(self, task: str) -> None:
+        """End everything, for nothing but a new start helps."""
+        if not self.beyond_help:
+            self.beyond_help = task
+            self._over.set()
 
     def _start(self) -> None:
         for line, task in self._lines.items():
@@ -129,21 +132,19 @@ class Supervisor:
             if task is None:
                 self._listeners[listener] = asyncio.create_task(self._keep_listener(listener), name=listener.label)
 
-    async def _stop(self, lines: Sequence[Line], keepers: Sequence[Runnable], listeners: Sequence[Listener]) -> None:
-        """Rule 4."""
+    async def _stop(
+        self, lines: Sequence[Line], running: Sequence[Task], keeping: Sequence[Task], listening: Sequence[Task]
+    ) -> None:
+        """Rule 4, for the tasks of these lines, of keepers and of listeners."""
         until = asyncio.get_running_loop().time() + STOP_LISTENERS_S
-        gates = _tasks(self._listeners[listener] for listener in listeners)
-        for task in gates:
+        for task in listening:
             task.cancel()
         finishing = [asyncio.create_task(line.finish(), name=f"line {line.name}") for line in lines]
-        await self._ended(gates, STOP_LISTENERS_S)
+        await self._ended(listening, STOP_LISTENERS_S)
         await self._ended(finishing, until - asyncio.get_running_loop().time())
-        ends = _tasks(self._lines[line] for line in lines) + _tasks(self._keepers[keeper] for keeper in keepers)
-        for task in (*finishing, *ends):
+        for task in (*finishing, *running, *keeping):
             task.cancel()
-        await self._ended(ends, STOP_LINES_S)
-        for listener in listeners:
-            self._up.discard(listener)
+        await self._ended((*running, *keeping), STOP_LINES_S)
 
     async def _ended(self, tasks: Sequence[Task], timeout_s: float) -> None:
         if not tasks:
@@ -216,9 +217,8 @@ class Supervisor:
         failures = self._failures[task]
         failures.append(now)
         if len(failures) == FAILURES and now - failures[0] <= FAILURES_S and not self.beyond_help:
-            self.beyond_help = task
             _log.critical('event=giving_up task="%s" failures=%d within_s=%.0f', task, FAILURES, now - failures[0])
-            self._over.set()
+            self.give_up(task)
 
 
 class _Trouble:

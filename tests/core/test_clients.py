@@ -87,3 +87,17 @@ def test_the_one_who_left_last_is_remembered_longest() -> None:
 
 def test_a_lease_is_small_against_a_burst() -> None:
     assert RATE.requests_per_s * 0.5 > LEASE
+
+
+def test_another_rate_begins_with_full_buckets_and_keeps_the_counts() -> None:
+    table = ClientTable(ModbusServerStats(), burst_s=1.0)
+    client = table.arrived("192.0.2.1", ClientRate(requests_per_s=100.0), 0.0)
+    assert hot(client, 150) == 100
+    asked = client.requests
+    table.limit(lambda _name: ClientRate(requests_per_s=30.0), 2.0, 0.0)
+    assert client.requests == asked
+    assert hot(client, 150) == 60
+    table.limit(lambda _name: FREE, 2.0, 0.0)
+    assert hot(client, 5000) == 5000
+    assert client.requests == asked + 60 + 5000
+    assert hot(table.arrived("192.0.2.2", FREE, 0.0), 5000) == 5000

@@ -242,6 +242,38 @@ def test_changes_are_kept_once_a_condition() -> None:
     assert changes.count(plant.watch(100)) == 1
 
 
+def test_another_site_goes_on_with_what_is_known_of_the_same_lines_and_devices() -> None:
+    plant = Plant((module.HISTORY_DOWN, module.NOT_READY))
+    plant.shows(array_faults=1)
+    plant.conditions.gateway.tell(module.HISTORY_DOWN, raised=True, now=1.0)
+    plant.line.state = LineState.DOWN
+    plant.wait(10.0)
+    before = {watch.condition.code: watch for watch in plant.conditions}
+    other = FakeLine("b", 2)
+    new = Device("e", 8, 1, MAP)
+    new.line = other
+    site = Site.of("s", (plant.line, other), [plant.device, new])
+    plant.conditions = Conditions(site, (module.HISTORY_DOWN,), plant.now, plant.conditions)
+    gateway = plant.conditions.gateway
+    assert plant.conditions.devices[7].by_code[100] is before[100]
+    assert gateway.by_code[451] is before[451]
+    assert gateway.by_code[1001] is before[1001]
+    assert gateway.by_code[1002].state is UNKNOWN
+    assert 453 not in gateway.by_code
+    assert {severity.name: count for severity, count in gateway.active.items()} == {
+        "INFO": 0,
+        "WARNING": 1,
+        "CRITICAL": 1,
+    }
+    plant.line.state = LineState.OPEN
+    plant.wait(1.0)
+    assert gateway.worst is Severity.WARNING
+    assert plant.conditions.devices[8].by_code[100].state is UNKNOWN
+    moved = Conditions(Site.of("s", (other,), [new]), (module.HISTORY_DOWN,), plant.now, plant.conditions)
+    assert list(moved.devices) == [8]
+    assert 1001 not in moved.gateway.by_code
+
+
 def test_a_look_without_news_changes_nothing() -> None:
     plant = Plant()
     plant.shows(array_faults=1)

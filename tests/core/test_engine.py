@@ -8,9 +8,11 @@ import math
 import struct
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 
+from gateway.core.settings import PollSettings
 from gateway.core.site import LineState, Outcome
 from gateway.core.snapshot import DeviceState
 from gateway.errors import (
@@ -458,3 +460,33 @@ def test_a_line_that_stops_repeats_nothing(virtual_line: MakeLine) -> None:
     line.run(30.0)
     assert [type(outcome) for outcome in outcomes] == [ShuttingDown]
     assert len(line.sent) == count + 1
+
+
+def test_a_line_goes_on_by_other_settings_of_the_same_wire(virtual_line: MakeLine) -> None:
+    line = virtual_line(Registers(1), poll=PollSettings(live_s=3600.0, settings_s=3600.0), retries=0)
+    line.run(10.0)
+    device, before = line.devices[0], len(line.sent)
+    snapshot = device.snapshot
+    line.run(60.0)
+    assert len(line.sent) == before
+    new = replace(line.engine.settings, index=2, poll=PollSettings(live_s=1.0, settings_s=3600.0), retries=3)
+    assert line.engine.settings.same_wire(new)
+    line.engine.adjust(new, line.now)
+    assert device.snapshot is snapshot
+    line.run(10.0)
+    assert 8 <= len(line.sent) - before <= 30  # polled about once a second
+    assert device.snapshot.state is DeviceState.ONLINE
+    assert line.engine.stats.opens == 1
+    assert not line.engine.settings.same_wire(replace(new, baudrate=19200))
+    assert not line.engine.settings.same_wire(replace(new, port="elsewhere"))
+
+
+def test_other_queue_limits_hold_from_now_on(virtual_line: MakeLine) -> None:
+    line = virtual_line(Registers(1), queue_limit=9)
+    line.run(10.0)
+    line.engine.adjust(replace(line.engine.settings, queue_limit=1), line.now)
+    outcomes: list[Outcome] = []
+    for address in (0x100, 0x200, 0x300):
+        line.read(line.devices[0], registers(address, 2), outcomes.append)
+    line.run(5.0)
+    assert sum(isinstance(outcome, QueueFull) for outcome in outcomes) == 2

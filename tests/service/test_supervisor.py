@@ -67,11 +67,13 @@ class FakeListener:
         self.errors = errors or []
         self.bound: tuple[str, int] | None = None
         self.started = asyncio.Event()
+        self.on_start: Callable[[], None] = lambda: None
         self.on_stop: Callable[[], None] = lambda: None
 
     async def start(self) -> None:
         if self.errors:
             raise self.errors.pop(0)
+        self.on_start()
         self.bound = ("127.0.0.1", 1)
         self.started.set()
 
@@ -247,19 +249,16 @@ async def test_a_change_stops_what_goes_starts_what_comes_and_leaves_the_rest() 
     stays, leaves, comes = FakeListener("stays"), FakeListener("leaves"), FakeListener("comes")
     stays.on_stop = lambda: pytest.fail("touched") if not stopping else None
     stopping = False
+    went: list[tuple[bool, bool, object]] = []
     supervisor = Supervisor(time, [kept, gone], [stays, leaves], sleep=time.sleep)
-    seen: list[object] = []
-
-    def turn() -> None:
-        seen.append((gone.finished, gone.cancelled, leaves.bound, new.running.is_set(), comes.bound))
-
     async with running(supervisor):
         await supervisor.settled()
         await gone.running.wait()
-        await supervisor.change([new, kept], [stays, comes], [], turn)
-        assert seen == [(True, True, None, False, None)]
+        comes.on_start = lambda: went.append((gone.finished, gone.cancelled, leaves.bound))
+        await supervisor.change([new, kept], [stays, comes], [])
         await supervisor.settled()
         await new.running.wait()
+        assert went == [(True, True, None)]  # all that goes had gone
         assert (kept.finished, kept.cancelled) == (False, False)
         assert supervisor.down() == ()
         stopping = True

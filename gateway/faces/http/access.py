@@ -4,7 +4,8 @@ Rule 1: without a file everybody may ask; with one or both, whoever shows any of
         to all: it tells nothing, and what watches processes has no secret.
 Rule 2: what was shown is compared in constant time with every credential there is, as digests.
 Rule 3: a secret is in no message, and digests are all that is kept of it.
-Rule 4: files are read when a listener starts; one that cannot be used keeps the listener closed, never open to all.
+Rule 4: files are read when a listener starts and when the configuration is read again; one that cannot be used keeps
+        the listener closed, or what was read before in use, and never opens to all.
 """
 
 from __future__ import annotations
@@ -109,10 +110,16 @@ def tls_context(settings: HttpSettings) -> ssl.SSLContext | None:
     """TLS 1.2 or newer with the certificate of the settings, None without one; ListenError names the file."""
     if not settings.tls_certificate:
         return None
-    for path in (settings.tls_certificate, settings.tls_private_key):
-        _read(path)
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
+    load_certificate(context, settings)
+    return context
+
+
+def load_certificate(context: ssl.SSLContext, settings: HttpSettings) -> None:
+    """Have new connections of the context get the certificate of the settings; ListenError as for `tls_context`."""
+    for path in (settings.tls_certificate, settings.tls_private_key):
+        _read(path)
     try:
         # The password is asked for on the terminal otherwise; a service has none.
         context.load_cert_chain(settings.tls_certificate, settings.tls_private_key, password="")
@@ -122,7 +129,6 @@ def tls_context(settings: HttpSettings) -> ssl.SSLContext | None:
             f"{settings.tls_certificate} and {settings.tls_private_key}: no certificate with its key in PEM form: "
             f"{str(reason).replace('_', ' ').lower()}"
         ) from None
-    return context
 
 
 def _read(path: str) -> bytes:
@@ -132,11 +138,12 @@ def _read(path: str) -> bytes:
         raise ListenError(f"{path}: {os.strerror(error.errno) if error.errno else error}") from None
 
 
-def guard(access: Access, refused: Callable[[], None]) -> Middleware:
-    """A middleware that answers 401 to who is not admitted; `refused` counts."""
+def guard(current: Callable[[], Access], refused: Callable[[], None]) -> Middleware:
+    """A middleware that answers 401 to who is not admitted by the `current` credentials; `refused` counts."""
 
     @web.middleware
     async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
+        access = current()
         if request.path in OPEN_PATHS or access.admits(request.headers.get(hdrs.AUTHORIZATION, "")):
             return await handler(request)
         refused()

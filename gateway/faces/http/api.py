@@ -35,10 +35,14 @@ class LogApi:
     """Answers requests for the log; `log` is None where no history is kept."""
 
     def __init__(self, site: Site, log: DayLog | None, send_timeout_s: float) -> None:
-        self._devices = frozenset(device.name for device in site.devices)
-        self._log = log
+        self.adjust(site, log)
         self._send_timeout_s = send_timeout_s
         self._exports = 0
+
+    def adjust(self, site: Site, log: DayLog | None) -> None:
+        """Answer about another site, or from another log; exports that are being sent go on."""
+        self._devices = frozenset(device.name for device in site.devices)
+        self._log = log
 
     async def handle(self, request: web.Request) -> web.StreamResponse:
         """The days asked for."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 from aiohttp import hdrs, web
 
@@ -19,7 +20,7 @@ from gateway.core.clients import Client
 from gateway.core.conditions import Conditions
 from gateway.core.daylog import DayLog
 from gateway.core.site import Site
-from gateway.core.stats import HistoryStats, ModbusServerStats, NotifyStats
+from gateway.core.stats import HistoryStats, ModbusServerStats, NotifyStats, ServiceStats
 from gateway.faces.http import api
 from gateway.faces.http import clients as client_list
 from gateway.faces.http import conditions as condition_list
@@ -63,23 +64,58 @@ class HttpFace:
         clients: Iterable[Client] = (),
         conditions: Conditions | None = None,
         notifications: Sequence[NotifyStats] = (),
+        service: ServiceStats | None = None,
     ) -> None:
         self._site = site
         self._clock = clock
         self._not_ready = not_ready
         self.stats = HttpStats()
         self._settings = settings
-        counts = Counts(modbus, snmp, self.stats, not_ready, history, clients, conditions, notifications)
-        self._exposition = Exposition(site, clock, counts)
+        self._access = Access()
+        self._counts = Counts(modbus, snmp, self.stats, not_ready, history, clients, conditions, notifications, service)
+        self._exposition = Exposition(site, clock, self._counts)
         self._clients = clients
         self._conditions = conditions
         self._log_api = LogApi(site, log, settings.send_timeout_s)
-        self.listeners: Sequence[HttpListener] = tuple(
-            HttpListener(host, port, self._application, settings, self.stats) for host, port in settings.listen
-        )
+        self.listeners: Sequence[HttpListener] = ()
+        self.listeners = self._listeners()
+
+    def adjust(
+        self,
+        settings: HttpSettings,
+        access: Access,
+        site: Site,
+        *,
+        history: HistoryStats | None,
+        log: DayLog | None,
+        conditions: Conditions | None,
+        notifications: Sequence[NotifyStats],
+    ) -> None:
+        """Go on by other settings, with the credentials that were read of them, for another site.
+
+        `listeners` are those that are wanted then: the same ones where address and kind are the same.
+        """
+        self._settings, self._access, self._site = settings, access, site
+        self._conditions = conditions
+        self._counts = replace(self._counts, history=history, conditions=conditions, notifications=notifications)
+        self._exposition.adjust(site, self._counts)
+        self._log_api.adjust(site, log)
+        self.listeners = self._listeners()
+        for listener in self.listeners:
+            listener.adjust(settings)
+
+    def _listeners(self) -> tuple[HttpListener, ...]:
+        """The listeners of the settings; those that there are already are taken."""
+        present = {listener.key: listener for listener in self.listeners}
+        wanted = [
+            HttpListener(host, port, self._application, self._settings, self.stats)
+            for host, port in self._settings.listen
+        ]
+        return tuple(present.get(listener.key, listener) for listener in wanted)
 
     def _application(self) -> web.Application:
-        guarded = guard(Access.read(self._settings), self._count_refused)
+        self._access = Access.read(self._settings)
+        guarded = guard(lambda: self._access, self._count_refused)
         application = web.Application(client_max_size=0, middlewares=[guarded])
         application.router.add_get("/", self._index)
         application.router.add_get("/metrics", self._metrics)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import zlib
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterator
 
 from prometheus_client import CollectorRegistry, GCCollector, ProcessCollector
 from prometheus_client.exposition import generate_latest
@@ -19,6 +19,7 @@ from prometheus_client.openmetrics.exposition import generate_latest as generate
 from gateway.clock import Clock
 from gateway.core.site import Site
 from gateway.faces.http.devices import DeviceMetrics
+from gateway.faces.http.metric import MetricInfo
 from gateway.faces.http.own import Counts, OwnMetrics
 from gateway.faces.http.text import Format, Lines, header
 
@@ -34,21 +35,32 @@ class Exposition:
     def __init__(self, site: Site, clock: Clock, counts: Counts) -> None:
         """Prepare all series; MapError when two models give one metric name different labels or types."""
         self._clock = clock
+        self._site = site
         self._devices = DeviceMetrics(site)
-        self._own = OwnMetrics(site, clock, counts)
+        self._started_at = clock.wall()
+        self._own = OwnMetrics(site, counts, self._started_at)
         self._process = CollectorRegistry()
         ProcessCollector(registry=self._process)
         GCCollector(registry=self._process)
 
+    def adjust(self, site: Site, counts: Counts) -> None:
+        """Tell of another site from now on; a scrape under way ends as it began. MapError as for a new one."""
+        if site is not self._site:
+            self._devices = DeviceMetrics(site)
+        self._site = site
+        self._own = OwnMetrics(site, counts, self._started_at)
+
     async def pieces(self, form: Format) -> AsyncIterator[bytes]:
         """The exposition in pieces of about `PIECE_BYTES`, a turn of the loop between two of them."""
+        devices, own = self._devices, self._own
         written: list[Lines] = []
-        for lines in self._devices.write():
+        for lines in devices.write():
             written.append(lines)
             if len(written) % DEVICES_A_TURN == 0:
                 await asyncio.sleep(0)
         piece = bytearray()
-        for block in self._blocks(form, written, self._clock.monotonic()):
+        now = self._clock.monotonic()
+        for block in self._blocks(form, devices.families(written, now), own.families(now)):
             piece += block
             if len(piece) >= PIECE_BYTES:
                 yield bytes(piece)
@@ -56,8 +68,8 @@ class Exposition:
                 await asyncio.sleep(0)
         yield bytes(piece)
 
-    def _blocks(self, form: Format, written: Sequence[Lines], now: float) -> Iterator[bytes]:
-        for families in (self._devices.families(written, now), self._own.families(now)):
+    def _blocks(self, form: Format, *metrics: Iterator[tuple[MetricInfo, Lines]]) -> Iterator[bytes]:
+        for families in metrics:
             for info, lines in families:
                 yield header(info, form)
                 yield b"".join(lines)

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import asyncio
 import os
+import ssl
 from collections.abc import Callable
 
 from aiohttp import web
 
 from gateway.errors import ListenError
-from gateway.faces.http.access import tls_context
+from gateway.faces.http.access import load_certificate, tls_context
 from gateway.faces.http.own import HttpStats
 from gateway.faces.http.settings import HttpSettings
 
@@ -42,6 +43,9 @@ class HttpListener:
         self._stats = stats
         self._runner: web.AppRunner | None = None
         self._server: asyncio.Server | None = None
+        self._tls: ssl.SSLContext | None = None
+        self.key = (host, port, bool(settings.tls_certificate))
+        """Two listeners that agree in this are the same."""
         self._recount: asyncio.TimerHandle | None = None
 
     @property
@@ -60,6 +64,7 @@ class HttpListener:
             application, tls = self._application(), tls_context(self._settings)
         except ListenError as error:
             raise ListenError(f"{self.label}: {error}") from None
+        self._tls = tls
         runner = web.AppRunner(
             application,
             access_log=None,
@@ -85,6 +90,12 @@ class HttpListener:
         except asyncio.CancelledError:
             await self.stop()
             raise
+
+    def adjust(self, settings: HttpSettings) -> None:
+        """Go on by other settings, with what the certificate files hold now; ListenError when they are of no use."""
+        self._settings = settings
+        if self._tls is not None:
+            load_certificate(self._tls, settings)
 
     async def stop(self) -> None:
         """Stop listening and close every connection; replies under way have `stop_grace_s`."""

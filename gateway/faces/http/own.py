@@ -11,11 +11,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from gateway import __version__
-from gateway.clock import Clock
 from gateway.core.clients import Client
 from gateway.core.conditions import Conditions, DeviceConditions
 from gateway.core.site import Site
-from gateway.core.stats import HistoryStats, ModbusServerStats, NotifyStats, TlsStats
+from gateway.core.stats import HistoryStats, ModbusServerStats, NotifyStats, ServiceStats, TlsStats
 from gateway.faces.http.clients import CLIENT_RULES, client_sources
 from gateway.faces.http.conditions import (
     DEVICE_CONDITION_RULES,
@@ -61,6 +60,29 @@ GATEWAY_RULES: tuple[Rule[GatewayView], ...] = (
     one(
         gateway_gauge("ready", "1 while everything that is configured listens, as /readyz says."),
         lambda view: view.ready,
+    ),
+)
+
+SERVICE_RULES: tuple[Rule[ServiceStats], ...] = (
+    one(
+        gateway_gauge(
+            "config_last_reload_successful", "1 while the configuration that was last read is the one in use."
+        ),
+        lambda stats: stats.reload_works,
+    ),
+    one(
+        gateway_gauge(
+            "config_last_reload_success_timestamp_seconds", "When the configuration in use was read, Unix time."
+        ),
+        lambda stats: stats.configured_at,
+    ),
+    each(
+        gateway_counter("config_reloads", "Times that the configuration was read again, by outcome.", "outcome"),
+        lambda stats: dict.fromkeys(("applied", "refused"), 0) | stats.reloads,
+    ),
+    each(
+        gateway_counter("task_restarts", "Times that a task died of a bug and was started again.", "task"),
+        lambda stats: stats.restarts,
     ),
 )
 
@@ -164,6 +186,7 @@ OWN_METRICS: tuple[MetricInfo, ...] = tuple(
     rule.metric
     for rules in (
         GATEWAY_RULES,
+        SERVICE_RULES,
         LINE_RULES,
         DEVICE_RULES,
         MODBUS_RULES,
@@ -202,14 +225,16 @@ class Counts:
     clients: Iterable[Client] = ()
     conditions: Conditions | None = None  # None: nobody watches them
     notifications: Sequence[NotifyStats] = ()
+    service: ServiceStats | None = None  # None: nobody supervises it
 
 
 class OwnMetrics:
     """The gateway's own metrics, each line and counter read once a scrape."""
 
-    def __init__(self, site: Site, clock: Clock, counts: Counts) -> None:
+    def __init__(self, site: Site, counts: Counts, started_at: float) -> None:
+        """`started_at` is wall time."""
         self._counts = counts
-        self._started_at = clock.wall()
+        self._started_at = started_at
         self._lines = [Source.labelled(line, LINE_LABELS, (line.name, site.name)) for line in site.lines]
         self._devices = [Source.labelled(device, DEVICE_LABELS, device_labels(site, device)) for device in site.devices]
 
@@ -218,6 +243,8 @@ class OwnMetrics:
         counts = self._counts
         lines = [Source(LineView(line.of, line.of.status(now)), line.labels, line.written) for line in self._lines]
         yield from families(GATEWAY_RULES, [Source(GatewayView(self._started_at, not counts.not_ready()))])
+        if counts.service is not None:
+            yield from families(SERVICE_RULES, [Source(counts.service)])
         yield from families(LINE_RULES, lines)
         yield from families(DEVICE_RULES, self._devices)
         yield from families(MODBUS_RULES, [Source(counts.modbus)])

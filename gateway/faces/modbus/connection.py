@@ -182,6 +182,10 @@ class Connection(asyncio.Protocol):
             self._dispatcher = dispatcher
             self._find = dispatcher.hot.find
 
+    def adjust(self, settings: ModbusSettings) -> None:
+        """Go on by other settings."""
+        self._settings = settings
+
     @property
     def idle(self) -> bool:
         """Whether the client waits for nothing."""

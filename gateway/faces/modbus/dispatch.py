@@ -130,6 +130,13 @@ class Dispatcher:
         self._limiter = shared.limiter
         self._writer = shared.writer
 
+    def reroute(self, routes: Mapping[int, Serving], shared: Shared) -> None:
+        """Serve these from now on; what is under way ends as it began."""
+        self._routes = routes
+        self._limiter = shared.limiter
+        self._writer = shared.writer
+        self.hot.clear()
+
     def answer(self, unit: int, pdu: bytes, client: Client, now: float, role: str | None = None) -> bytes | Waiting:
         """The reply to a request, or what its answer has to come from; `role`: that of the client's certificate.
 

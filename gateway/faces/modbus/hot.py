@@ -33,6 +33,10 @@ class HotReplies:
     def __len__(self) -> int:
         return len(self._entries)
 
+    def clear(self) -> None:
+        """Forget all."""
+        self._entries.clear()
+
     def keep(self, request: bytes, device: Device, made: FromMemory, reply: bytes) -> None:
         """Keep `reply` for `request`; both without transaction id."""
         if len(self._entries) >= self._capacity and request not in self._entries:

@@ -29,10 +29,11 @@ from gateway.faces.modbus.accepting import Acceptor, listening_socket
 from gateway.faces.modbus.admission import decide, rate_of
 from gateway.faces.modbus.connection import Connection
 from gateway.faces.modbus.dispatch import Dispatcher, Routes, Shared
-from gateway.faces.modbus.settings import ModbusSettings
+from gateway.faces.modbus.settings import ModbusSettings, TlsSettings
 from gateway.faces.modbus.sockets import Hub, SocketTransport
-from gateway.faces.modbus.tcp import bind_problem
+from gateway.faces.modbus.tcp import allowed, bind_problem
 from gateway.faces.modbus.tls import TlsDoor
+from gateway.faces.modbus.tls_files import Credentials
 from gateway.faces.modbus.writer import Writer
 
 logger = logging.getLogger(__name__)
@@ -62,6 +63,8 @@ class Listener:
         shown = f"[{host}]" if ":" in host else host
         face = "modbus" if door is None else "modbus tls"
         self.label = f"{face} {shown}:{port} line {line}" if line else f"{face} {shown}:{port}"
+        self.key = (host, port, line, door)
+        """Two listeners that agree in this are the same."""
 
     @property
     def bound(self) -> tuple[str, int] | None:
@@ -132,36 +135,102 @@ class ModbusServer:
     def __init__(self, settings: ModbusSettings, site: Site, clock: Clock, stats: ModbusServerStats) -> None:
         self.settings = settings
         self.hub = Hub()
-        audit = Audit(stats.refused)
-        routes = Routes(settings, site)
-        self.clients = ClientTable(stats, settings.rate.burst_s)
-        limiter = LineLimiter(settings.rate.lines, settings.rate.burst_s, site.devices)
-        self.writer = None if settings.writes is None else Writer(settings.writes, site, clock, stats, audit)
-        shared = Shared(stats, audit, limiter, self.writer)
-        self.dispatcher = Dispatcher(routes.by_unit(), clock, shared)
-        self.door: TlsDoor | None = None
-        if settings.tls is not None:
-            stats.tls = TlsStats()
-            barred = Dispatcher({}, clock, shared, barred=True)
-            self.door = TlsDoor(settings.tls, barred, clock, stats.tls, frame_timeout_s=settings.frame_timeout_s)
-        listeners = [Listener(self, self.dispatcher, host, port) for host, port in settings.listen]
-        for group in settings.lines:
-            dispatcher = Dispatcher(routes.of_line(group.line), clock, shared)
-            door = self.door if group.tls else None
-            if group.tls and door is None:
-                raise ValueError("a listener with TLS needs the settings of TLS")  # never open to all instead
-            listeners += [
-                Listener(self, dispatcher, host, port, line=group.line, door=door) for host, port in group.listen
-            ]
-        for host, port in () if settings.tls is None else settings.tls.listen:
-            listeners.append(Listener(self, self.dispatcher, host, port, door=self.door))
-        self.listeners: Sequence[Listener] = tuple(listeners)
         self.stats = stats
+        self.clients = ClientTable(stats, settings.rate.burst_s)
+        self.writer: Writer | None = None
+        self.door: TlsDoor | None = None
+        self.listeners: Sequence[Listener] = ()
+        self._clock = clock
         self._now = clock.monotonic
+        self._audit = Audit(stats.refused)
         self._connections: set[Connection] = set()
         self._listening: set[Listener] = set()
         self._sweep: asyncio.TimerHandle | None = None
         self._refusals_told = LogBudget()
+        self._shared = self._share(settings, site)
+        self.dispatcher = Dispatcher({}, clock, self._shared)
+        self._of_line: dict[str, Dispatcher] = {}
+        self._route(settings, site)
+        if settings.tls is not None:
+            self.door = self._new_door(settings.tls)
+        self.listeners = self._listeners()
+
+    def adjust(self, settings: ModbusSettings, site: Site, credentials: Credentials | None) -> None:
+        """Go on by other settings, for another site; `credentials` are what the files of its TLS hold.
+
+        `listeners` are those that are wanted then: the same ones where address and kind are the same. Connections
+        stay, but those of clients that may not connect any more.
+        """
+        now = self._now()
+        before, self.settings = self.settings, settings
+        self._shared = self._share(settings, site)
+        self._route(settings, site)
+        if settings.rate != before.rate:
+            self.clients.limit(lambda name: rate_of(name, settings.rate), settings.rate.burst_s, now)
+        if settings.tls is None:
+            self.door, self.stats.tls = None, None
+        else:
+            self.door = self.door or self._new_door(settings.tls)
+            if credentials is not None:
+                self.door.adjust(settings.tls, credentials)
+        self.listeners = self._listeners()
+        for connection in tuple(self._connections):
+            connection.adjust(settings)
+            if not allowed(connection.peer, settings.allow):
+                logger.info("event=connection_ended peer=%s reason=not_allowed", connection.peer)
+                connection.end("not_allowed")
+
+    def files_unusable(self, problem: str) -> None:
+        """Say that the certificate files on disk are of no use; those that were read before stay in use."""
+        if self.door is not None:
+            self.door.keep(problem)
+
+    def _share(self, settings: ModbusSettings, site: Site) -> Shared:
+        """What all ways in have in common; the writer goes on where there is one."""
+        limiter = LineLimiter(settings.rate.lines, settings.rate.burst_s, site.devices)
+        if settings.writes is None:
+            if self.writer is not None:
+                self.writer.refuse_waiting()
+                self.writer.stop()
+            self.writer = None
+        elif self.writer is not None:
+            self.writer.adjust(settings.writes, site)
+        else:
+            self.writer = Writer(settings.writes, site, self._clock, self.stats, self._audit)
+            if self._listening:
+                self.writer.start()
+        return Shared(self.stats, self._audit, limiter, self.writer)
+
+    def _route(self, settings: ModbusSettings, site: Site) -> None:
+        routes = Routes(settings, site)
+        self.dispatcher.reroute(routes.by_unit(), self._shared)
+        for group in settings.lines:
+            dispatcher = self._of_line.setdefault(group.line, Dispatcher({}, self._clock, self._shared))
+            dispatcher.reroute(routes.of_line(group.line), self._shared)
+
+    def _new_door(self, settings: TlsSettings) -> TlsDoor:
+        self.stats.tls = TlsStats()
+        barred = Dispatcher({}, self._clock, self._shared, barred=True)
+        return TlsDoor(settings, barred, self._clock, self.stats.tls, frame_timeout_s=self.settings.frame_timeout_s)
+
+    def _listeners(self) -> tuple[Listener, ...]:
+        """The listeners of the settings; those that there are already are taken."""
+        settings, door = self.settings, self.door
+        wanted: list[tuple[Dispatcher, str, int, str, TlsDoor | None]]
+        wanted = [(self.dispatcher, host, port, "", None) for host, port in settings.listen]
+        for group in settings.lines:
+            if group.tls and door is None:
+                raise ValueError("a listener with TLS needs the settings of TLS")  # never open to all instead
+            line_door = door if group.tls else None
+            wanted += [(self._of_line[group.line], host, port, group.line, line_door) for host, port in group.listen]
+        for host, port in () if settings.tls is None else settings.tls.listen:
+            wanted.append((self.dispatcher, host, port, "", door))
+        present = {listener.key: listener for listener in self.listeners}
+        listeners = []
+        for dispatcher, host, port, line, its_door in wanted:
+            listener = Listener(self, dispatcher, host, port, line=line, door=its_door)
+            listeners.append(present.get(listener.key, listener))
+        return tuple(listeners)
 
     def admit(self, listener: Listener, connection: Connection, peer: str) -> Client | None:
         """Whose connection this is, when it may stay (rules 1 and 2)."""

@@ -8,7 +8,8 @@ Rule 2: a certificate without a role has the least rights: none, or to read wher
 Rule 3: a handshake that fails is counted under its reason, and told once a minute for each peer and reason.
 Rule 4: a handshake takes as long as `HANDSHAKE_TOKENS` requests from memory, and costs its client as many of its tokens
         (core/clients.py), or those that it has; who has none is cut off before it begins.
-Rule 5: `reload` takes all files or none. Open connections go on, but those whose certificate is now revoked end.
+Rule 5: `adjust` takes files that were judged good together. Open connections go on, but those whose certificate is now
+        revoked end.
 """
 
 from __future__ import annotations
@@ -61,19 +62,25 @@ class TlsDoor:
             self._stats.problem = str(error)
             raise
 
-    def reload(self) -> None:
-        """Take what is on disk now (rule 5)."""
-        try:
-            credentials = load(self._settings.files, self._clock.wall())
-        except TlsFilesError as error:
-            self._keep(str(error))
-            return
+    def _take(self, credentials: Credentials) -> None:
         self._use(credentials)
         logger.info("event=tls_reloaded")
         for session, certificate in tuple(self._sessions.items()):
             if credentials.revoked(certificate):
                 logger.warning("event=connection_ended peer=%s reason=certificate_revoked", session.connection.peer)
                 session.connection.end("certificate_revoked")
+
+    def adjust(self, settings: TlsSettings, credentials: Credentials) -> None:
+        """Other settings and their files, which were judged good, from now on (rule 5).
+
+        Who was let in without a role is cut off when it needs one now.
+        """
+        stricter = settings.require_role and not self._settings.require_role
+        self._settings = settings
+        self._take(credentials)
+        for session in tuple(self._sessions) if stricter else ():
+            if session.connection.role is None:
+                session.connection.end("role_required")
 
     def session(self, connection: Connection) -> TlsSession:
         """What stands between a socket and a new connection."""
@@ -121,7 +128,8 @@ class TlsDoor:
         """A session is over."""
         self._sessions.pop(session, None)
 
-    def _keep(self, problem: str) -> None:
+    def keep(self, problem: str) -> None:
+        """Go on with what was read before, because the files on disk are of no use."""
         self._stats.reload_failures += 1
         self._stats.problem = problem
         kept = "none" if self._credentials is None else "old"

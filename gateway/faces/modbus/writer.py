@@ -15,7 +15,7 @@ import asyncio
 import logging
 import secrets
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass
 
 from gateway.clock import Clock
@@ -40,6 +40,7 @@ from gateway.core.writing import (
 )
 from gateway.devices.model import Space
 from gateway.errors import (
+    IllegalFunction,
     LedgerUnavailable,
     QueueFull,
     RequestError,
@@ -92,7 +93,7 @@ class Writer:
         self._clock = clock
         self._stats = stats
         self._audit = audit
-        self._devices = site.by_unit
+        self._devices: Mapping[int, Device] = site.by_unit
         self._rules = {device.unit_id: WriteRules(settings.rules, device) for device in site.devices}
         self._wear = Wear(settings.limits)
         self._slave = SlaveControl()
@@ -109,6 +110,20 @@ class Writer:
     def rules(self, device: Device) -> WriteRules:
         """Who may write what on a device."""
         return self._rules[device.unit_id]
+
+    def adjust(self, settings: WriteSettings, site: Site) -> None:
+        """Other rules, limits and devices from now on; the ledger stays, and so does what was begun."""
+        self._rules = {device.unit_id: WriteRules(settings.rules, device) for device in site.devices}
+        self._devices = {**self._devices, **site.by_unit}
+        self._wear.limit(settings.limits)
+        for unit in site.by_unit:
+            self._waiting.setdefault(unit, deque())
+
+    def refuse_waiting(self) -> None:
+        """Answer those that wait: nobody may write any more."""
+        for waiting in self._waiting.values():
+            while waiting:
+                self._tell(waiting.popleft(), Result(IllegalFunction("writes were turned off"), ()))
 
     def start(self) -> None:
         """Learn what the last run left; the loop runs."""

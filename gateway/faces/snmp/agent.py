@@ -53,17 +53,22 @@ class SnmpAgent:
         modbus: ModbusServerStats,
         *,
         conditions: Conditions | None = None,
+        before: SnmpAgent | None = None,
     ) -> None:
-        """Without `conditions` of somebody who tells them of the gateway, those of lines and devices are shown."""
-        self.counters = SnmpCounters()
+        """Without `conditions` of somebody who tells them of the gateway, those of lines and devices are shown.
+
+        With `before` it is made to be given to that one's `adjust`: same counters, same engine, same uptime.
+        """
+        self.counters: SnmpCounters = SnmpCounters() if before is None else before.counters
+        self.started_at: float = clock.monotonic() if before is None else before.started_at
         self.layout: Layout = shipped_layout(settings.enterprise_root)
-        self._settings = settings
+        self.settings = settings
         self._clock = clock
-        self._engine: Engine | None = None
+        self._engine: Engine | None = None if before is None else before._engine  # noqa: SLF001 - its own kind
         described = Gateway(
             site=site,
             version=gateway.__version__,
-            started_at=clock.monotonic(),
+            started_at=self.started_at,
             modbus=modbus,
             snmp=self.counters,
             contact=settings.contact,
@@ -85,25 +90,63 @@ class SnmpAgent:
         self._trees = tuple(contexts.values())
         self._responder = Responder(settings, contexts, self.counters)
         self._throttle = Throttle()
-        self.notifier = Notifier(
-            settings.receivers, self.layout, site=site.name, clock=clock, engine=self.engine, ticks=described.ticks
+        self._site_name = site.name
+        self._ticks = described.ticks
+        self.notifier = self._new_notifier(None)
+        self._listen_to_failures()
+        self.listeners: tuple[SnmpListener, ...] = ()
+        self.listeners = self._listeners()
+        if before is None:
+            self._warm_up()
+        elif self._engine is not None:
+            self.prepare()
+
+    def adjust(self, fresh: SnmpAgent) -> None:
+        """Go on as the agent that was made for it: with its settings and trees, as the same engine.
+
+        `listeners` are those that are wanted then: the same ones where address and context are the same. `notifier`
+        is another one only where its receivers or what they are told are others.
+        """
+        before = (self.settings.receivers, self.settings.enterprise_root, self._site_name)
+        self.settings, self._engine, self._site_name = fresh.settings, fresh._engine, fresh._site_name
+        self.layout, self.tree, self._trees = fresh.layout, fresh.tree, fresh._trees
+        self._responder = fresh._responder
+        if before != (self.settings.receivers, self.settings.enterprise_root, self._site_name):
+            same = before[1:] == (self.settings.enterprise_root, self._site_name)
+            self.notifier = self._new_notifier(self.notifier if same else None)
+        self._listen_to_failures()
+        self.listeners = self._listeners()
+        if any(listener.bound for listener in self.listeners):
+            self.prepare()
+
+    def _new_notifier(self, before: Notifier | None) -> Notifier:
+        return Notifier(
+            self.settings.receivers,
+            self.layout,
+            site=self._site_name,
+            clock=self._clock,
+            engine=self.engine,
+            ticks=self._ticks,
+            before=before,
         )
-        if settings.authentication_traps:
+
+    def _listen_to_failures(self) -> None:
+        if self.settings.authentication_traps:
             self._responder.on_authentication_failure = self.notifier.authentication_failed
-        self.listeners = (
-            *(SnmpListener(self, host, port) for host, port in settings.listen),
-            *(
-                SnmpListener(self, host, port, context_of(each.unit_id))
-                for each in settings.emc1
-                for host, port in each.listen
-            ),
-        )
-        self._warm_up()
+
+    def _listeners(self) -> tuple[SnmpListener, ...]:
+        """The listeners of the settings; those that there are already are taken."""
+        settings = self.settings
+        wanted = [SnmpListener(self, host, port) for host, port in settings.listen]
+        for each in settings.emc1:
+            wanted += [SnmpListener(self, host, port, context_of(each.unit_id)) for host, port in each.listen]
+        present = {listener.label: listener for listener in self.listeners}
+        return tuple(present.get(listener.label, listener) for listener in wanted)
 
     def engine(self) -> Engine:
         """The SNMPv3 engine of this start; the first call writes its boots. EngineLost when there can be none."""
         if self._engine is None:
-            settings = self._settings
+            settings = self.settings
             enterprise = settings.enterprise_root[6]
             now = self._clock.monotonic()
             self._engine = start_engine(settings.state_dir, enterprise, now, renew=settings.renew_engine)
@@ -111,7 +154,7 @@ class SnmpAgent:
 
     def prepare(self) -> None:
         """Make SNMPv3 ready where there are users: before a socket is bound, and once."""
-        users = self._settings.users
+        users = self.settings.users
         if not users or self._responder.security is not None:
             return
         try:
@@ -120,7 +163,7 @@ class SnmpAgent:
             _log.error('event=snmp_v3_off reason="%s"', error)
             return
         self._responder.security = Security(
-            engine, [user.credentials for user in users], self.counters, self._settings.reply_octets
+            engine, [user.credentials for user in users], self.counters, self.settings.reply_octets
         )
         _log.info("event=snmp_v3_on engine_id=%s boots=%d users=%d", engine.engine_id.hex(), engine.boots, len(users))
 

@@ -46,12 +46,18 @@ class Notifier:
         clock: Clock,
         engine: Callable[[], Engine],
         ticks: Callable[[float], int],
+        before: Notifier | None = None,
     ) -> None:
+        """With `before`, which must have ended by the time that this one runs, its receivers are told what is left."""
         self._clock = clock
         self._engine = engine
         now = clock.monotonic()
+        known = {} if before is None else {post.receiver: post for post in before._posts}  # noqa: SLF001 - its own kind
         self._posts: list[_Post] = []
         for receiver in receivers:
+            if receiver in known:
+                self._posts.append(known[receiver])
+                continue
             stats = NotifyStats(receiver.label, "inform" if receiver.inform else "trap")
             writer = PduWriter(layout, site, ticks, inform=receiver.inform)
             self._posts.append(_Post(receiver, Delivery(receiver, writer, stats, now), clock))

@@ -13,7 +13,14 @@ from gateway.core.clients import ClientTable
 from gateway.core.conditions import HISTORY_DOWN, Conditions
 from gateway.core.ratelimit import ClientRate
 from gateway.core.site import LineState, Site
-from gateway.core.stats import DeviceHistoryStats, HistoryStats, ModbusServerStats, NotifyStats, TlsStats
+from gateway.core.stats import (
+    DeviceHistoryStats,
+    HistoryStats,
+    ModbusServerStats,
+    NotifyStats,
+    ServiceStats,
+    TlsStats,
+)
 from gateway.faces.http.exposition import Exposition
 from gateway.faces.http.lines import ERROR_KINDS
 from gateway.faces.http.metric import MetricInfo, MetricKind
@@ -122,6 +129,7 @@ def test_what_is_collected_is_what_is_described(site: Site, clock: ManualClock) 
             clients=clients,
             conditions=conditions,
             notifications=notifications,
+            service=ServiceStats(restarts=Counter(history=1)),
         ),
     )
 

@@ -25,7 +25,7 @@ async def test_a_second_signal_does_not_wait(service: Service, second: signal.Si
         await service.log("event=stopping signal=SIGTERM")
         began = time.monotonic()
         assert await service.end(second) == 0
-        assert time.monotonic() - began < 0.5
+        assert time.monotonic() - began < 2.0
     assert "Traceback" not in program.log()
 
 

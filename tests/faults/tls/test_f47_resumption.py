@@ -72,7 +72,7 @@ async def test_f47_the_certificate_is_looked_at_each_time(serve_tls: ServeTls, p
     first = await site.connect(None, context=context)
     assert await first.query(11, PDU) == REPLY
     pki.revoke()
-    site.door.reload()
+    site.reload()
     with pytest.raises((ssl.SSLError, ConnectionError, EOFError)):
         await (await site.connect(None, context=context)).query(11, PDU)
     assert site.stats.refused == {"certificate_revoked": 1}

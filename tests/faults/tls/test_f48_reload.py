@@ -44,7 +44,7 @@ async def test_f48_new_connections_use_the_new_files_and_open_ones_go_on(serve_t
     old = await site.connect("reader")
     serial = new_certificate(pki)
     assert serial_seen_by(await site.connect("reader")) != serial  # what is on disk alone changes nothing
-    site.door.reload()
+    site.reload()
     new = await site.connect("reader")
     assert serial_seen_by(new) == serial
     assert await new.query(11, PDU) == await old.query(11, PDU) == REPLY
@@ -58,7 +58,7 @@ async def test_f48_another_client_authority(serve_tls: ServeTls, pki: Pki) -> No
     pki.issue("newcomer", issuer="new-ca")
     server_ca = pki.client("reader")
     shutil.copy(pki.folder / "new-ca.pem", pki.folder / "ca.pem")
-    site.door.reload()
+    site.reload()
     with pytest.raises((ssl.SSLError, ConnectionError, EOFError)):
         await (await site.connect(None, context=server_ca)).query(11, PDU)
 
@@ -96,7 +96,7 @@ async def test_f48_bad_files_keep_the_old_ones(
     before = serial_seen_by(await site.connect(None, context=context))
     BAD[problem](pki)
     with caplog.at_level(logging.ERROR):
-        site.door.reload()
+        site.reload()
     (message,) = [text for text in caplog.messages if "tls_reload_failed" in text]
     assert "kept=old" in message
     assert site.stats.reload_failures == 1
@@ -105,7 +105,7 @@ async def test_f48_bad_files_keep_the_old_ones(
     assert serial_seen_by(client) == before
     assert await client.query(11, PDU) == REPLY
     shutil.copytree(good, pki.folder, dirs_exist_ok=True)
-    site.door.reload()
+    site.reload()
     assert site.stats.problem == ""
 
 
@@ -127,7 +127,7 @@ async def test_f48_a_revoked_clients_connection_ends_with_the_reload(serve_tls: 
     site = await serve_tls(crl=True)
     revoked, other = await site.connect("operator"), await site.connect("reader")
     pki.revoke()
-    site.door.reload()
+    site.reload()
     assert await revoked.rest() == b""
     assert await other.query(11, PDU) == REPLY
     assert site.world.stats.closed["certificate_revoked"] == 1

@@ -11,8 +11,10 @@ from typing import Any
 import pytest
 
 from gateway.core.stats import TlsStats
+from gateway.errors import TlsFilesError
 from gateway.faces.modbus.settings import TlsSettings
 from gateway.faces.modbus.tls import TlsDoor
+from gateway.faces.modbus.tls_files import load
 from tests.faces.modbus.conftest import Client, Running, Serve, World
 from tests.faces.modbus.tls.site import Pki
 
@@ -51,6 +53,17 @@ class TlsSite:
         door = self.running.server.door
         assert door is not None
         return door
+
+    def reload(self) -> None:
+        """Have the files read again, as the service does on SIGHUP."""
+        settings, server = self.running.server.settings.tls, self.running.server
+        assert settings is not None
+        try:
+            credentials = load(settings.files, self.world.clock.wall())
+        except TlsFilesError as error:
+            server.files_unusable(str(error))
+        else:
+            self.door.adjust(settings, credentials)
 
     async def connect(self, name: str | None, **options: Any) -> Client:
         """A client with that certificate."""

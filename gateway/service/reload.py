@@ -1,0 +1,96 @@
+"""SIGHUP: the configuration and all files that it names are read again.
+
+Rule 1: everything is read, checked and built before anything is touched. Whatever is wrong refuses the whole; every
+        problem is logged, and what runs goes on untouched.
+Rule 2: only what changed is changed. A line, a connection, a listener, an SNMP engine that the new configuration
+        wants as before does not notice.
+Rule 3: the change itself is one step of the event loop: nobody sees a mixture. Reading and building happen in a
+        thread, so that nobody waits for them.
+Rule 4: what a running gateway cannot change is said by key path, and stays as it was.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+from gateway.clock import Clock
+from gateway.core.stats import ServiceStats
+from gateway.errors import ConfigError
+from gateway.service.changes import NEEDS_RESTART, changes
+from gateway.service.config import load_config
+from gateway.service.gateway import Gateway
+from gateway.service.systemd import Systemd
+
+SHOWN = 32
+"""How many changed keys, or problems, are logged at most."""
+
+_log = logging.getLogger(__name__)
+
+
+class Reloader:
+    """The keeper that waits for SIGHUP; `wanted` is its handler."""
+
+    name = "reload"
+
+    def __init__(self, path: Path, gateway: Gateway, clock: Clock, systemd: Systemd) -> None:
+        self._path = path
+        self._gateway = gateway
+        self._clock = clock
+        self._systemd = systemd
+        self._stats: ServiceStats = gateway.stats
+        self._asked = asyncio.Event()
+
+    def wanted(self) -> None:
+        """Read the configuration again, as soon as a reload that is under way is over."""
+        self._asked.set()
+
+    async def run(self) -> None:
+        """Reload whenever it is wanted, until cancelled."""
+        while True:
+            await self._asked.wait()
+            self._asked.clear()
+            began = self._clock.monotonic()
+            self._systemd.reloading(began)
+            try:
+                await self._reload(began)
+            finally:
+                self._systemd.ready(self._gateway.summary())
+
+    async def _reload(self, began: float) -> None:
+        gateway = self._gateway
+        before = gateway.config
+        try:
+            config = await asyncio.to_thread(load_config, self._path)
+            for key in (key for key in NEEDS_RESTART if getattr(config, key) != getattr(before, key)):
+                _log.warning("event=reload_needs_restart key=%s kept=old", key)
+            config = config.model_copy(update={key: getattr(before, key) for key in NEEDS_RESTART})
+            plan = await gateway.plan(config)
+        except ConfigError as error:
+            self._refused(error.problems)
+            return
+        try:
+            await gateway.change(plan)
+        except Exception:
+            gateway.supervisor.give_up(self.name)  # half of it may be done: only a new start is sure
+            raise
+        self._stats.reloads["applied"] += 1
+        self._stats.configured_at = self._clock.wall()
+        self._stats.reload_works = True
+        changed = changes(before, config)
+        _log.info('event=reloaded changed="%s" took_s=%.3f', _some(changed), self._clock.monotonic() - began)
+
+    def _refused(self, problems: Sequence[str]) -> None:
+        self._stats.reloads["refused"] += 1
+        self._stats.reload_works = False
+        for problem in problems[:SHOWN]:
+            _log.error("event=reload_problem problem=%s", json.dumps(problem, ensure_ascii=False))
+        _log.error("event=reload_refused problems=%d kept=old", len(problems))
+
+
+def _some(keys: Sequence[str]) -> str:
+    more = f" and {len(keys) - SHOWN} more" if len(keys) > SHOWN else ""
+    return ", ".join(keys[:SHOWN]).replace('"', "'") + more

@@ -1,0 +1,165 @@
+"""From one configuration to another: which parts stay the same objects."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from gateway.clock import SystemClock
+from gateway.errors import ConfigError
+from gateway.faces.snmp.agent import SnmpAgent
+from gateway.service.config import Config, parse_config
+from gateway.service.gateway import Gateway
+from gateway.service.reload import Reloader
+from gateway.service.systemd import Systemd
+
+LINE = """
+[[line]]
+name = "{name}"
+port = "/nonexistent/{name}"
+[[line.device]]
+name = "{name}-1"
+address = 1
+unit_id = {unit}
+model = "prostar-mppt"
+"""
+A, B = LINE.format(name="a", unit=11), LINE.format(name="b", unit=12)
+FACES = '[modbus]\nlisten = ["127.0.0.1:0"]\n[http]\nlisten = ["127.0.0.1:0"]\n'
+COMMUNITY = '[snmp]\nlisten = ["127.0.0.1:0"]\n[[snmp.community]]\nname = "public"\nsource = ["127.0.0.0/8"]\n'
+
+
+class Site:
+    """A folder with the files of a configuration."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def text(self, *parts: str) -> str:
+        return f'site = "ridge-07"\nstate_dir = "{self.folder}"\n' + "".join(parts)
+
+    def config(self, *parts: str) -> Config:
+        return parse_config(self.text(*parts))
+
+    def receiver(self, port: int, secret: str = "secret-1") -> str:
+        (self.folder / secret).write_text(secret)
+        return (
+            f'[[snmp.notify]]\naddress = "127.0.0.1:{port}"\nkind = "trap"\ncommunity_file = "{self.folder / secret}"\n'
+        )
+
+    def user(self, name: str) -> str:
+        (self.folder / name).write_text("correct-horse-1")
+        files = "".join(f'{kind}_password_file = "{self.folder / name}"\n' for kind in ("auth", "priv"))
+        return f'[[snmp.user]]\nname = "{name}"\n{files}'
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Site:
+    return Site(tmp_path)
+
+
+@asynccontextmanager
+async def running(config: Config) -> AsyncIterator[Gateway]:
+    gateway = Gateway(config, SystemClock())
+    stop = asyncio.Event()
+    task = asyncio.create_task(gateway.run(stop))
+    await gateway.supervisor.settled()
+    try:
+        yield gateway
+    finally:
+        stop.set()
+        await task
+
+
+def speaks_v3(agent: SnmpAgent) -> bool:
+    return agent._responder.security is not None
+
+
+async def change(gateway: Gateway, config: Config) -> None:
+    await gateway.change(await gateway.plan(config))
+
+
+async def test_the_same_configuration_changes_no_object(site: Site) -> None:
+    config = site.config(A, B, FACES, COMMUNITY)
+    async with running(config) as gateway:
+        before = (gateway.site, gateway.lines, gateway.listeners, gateway.keepers, gateway.conditions)
+        await change(gateway, site.config(A, B, FACES, COMMUNITY))
+        assert (gateway.site, gateway.lines, gateway.listeners, gateway.keepers, gateway.conditions) == before
+        assert gateway.not_ready() == ()
+
+
+async def test_a_line_more_keeps_the_others_and_all_listeners(site: Site) -> None:
+    async with running(site.config(A, FACES, COMMUNITY)) as gateway:
+        line, device, listeners = gateway.lines[0], gateway.site.devices[0], gateway.listeners
+        await change(gateway, site.config(B, A, FACES, COMMUNITY))
+        assert [one.name for one in gateway.lines] == ["b", "a"]
+        assert gateway.lines[1] is line
+        assert gateway.site.by_unit[11] is device
+        assert line.index == 2
+        assert gateway.listeners == listeners
+        await change(gateway, site.config(B, FACES, COMMUNITY))
+        assert [one.name for one in gateway.lines] == ["b"]
+        assert list(gateway.site.by_unit) == [12]
+        assert list(gateway.conditions.devices) == [12]
+
+
+async def test_a_plan_that_is_not_carried_out_touches_nothing(site: Site) -> None:
+    async with running(site.config(A, FACES, COMMUNITY)) as gateway:
+        before = (gateway.site, gateway.lines, gateway.listeners, gateway.keepers, gateway.config)
+        await gateway.plan(site.config(B, FACES, COMMUNITY, "[history]\nenabled = false\n"))
+        bad = FACES.replace("[http]", f'[http]\nbearer_token_file = "{site.folder}/none"')
+        with pytest.raises(ConfigError) as caught:
+            await gateway.plan(site.config(B, bad, COMMUNITY, site.user("noc")).model_copy())
+        assert [problem.split(":")[0] for problem in caught.value.problems] == ["http"]
+        assert (gateway.site, gateway.lines, gateway.listeners, gateway.keepers, gateway.config) == before
+
+
+async def test_snmpv3_comes_with_its_first_user_and_goes_with_its_last(site: Site) -> None:
+    async with running(site.config(A, FACES, COMMUNITY)) as gateway:
+        agent = gateway._snmp
+        assert not speaks_v3(agent)
+        await change(gateway, site.config(A, FACES, COMMUNITY, site.user("noc")))
+        assert speaks_v3(agent)
+        engine = agent.engine()
+        await change(gateway, site.config(A, FACES, COMMUNITY, site.user("noc"), site.user("admin")))
+        assert agent.engine() is engine
+        await change(gateway, site.config(A, FACES, COMMUNITY))
+        assert not speaks_v3(agent)
+
+
+async def test_a_receiver_that_stays_is_told_what_was_left_and_a_new_one_what_is_raised(site: Site) -> None:
+    first, second = site.receiver(9), site.receiver(10, "secret-2")
+    async with running(site.config(A, FACES, COMMUNITY, first)) as gateway:
+        (post,) = gateway._snmp.notifier._posts
+        await change(gateway, site.config(A, B, FACES, COMMUNITY, first))
+        assert gateway._snmp.notifier._posts == [post]
+        await change(gateway, site.config(A, B, FACES, COMMUNITY, second, first))
+        new, old = gateway._snmp.notifier._posts
+        assert old is post
+        assert [stats.receiver for stats in gateway._snmp.notifier.stats] == ["127.0.0.1:10", "127.0.0.1:9"]
+        assert gateway._snmp.notifier in gateway.keepers
+        assert new is not post
+        await change(gateway, site.config(A, B, FACES, COMMUNITY))
+        assert gateway._snmp.notifier not in gateway.keepers
+
+
+async def test_a_mistake_in_the_middle_of_a_change_ends_the_process_for_a_new_start(
+    site: Site, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = site.folder / "site.toml"
+    path.write_text(site.text(A, FACES))
+    gateway = Gateway(site.config(A, FACES), SystemClock())
+    reloader = Reloader(path, gateway, SystemClock(), Systemd({}))
+    gateway.keep(reloader)
+
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(gateway._modbus, "adjust", fail)
+    reloader.wanted()
+    await gateway.run(asyncio.Event())
+    assert gateway.supervisor.beyond_help == "reload"
+    assert 'event=task_failed task="reload"' in caplog.text
