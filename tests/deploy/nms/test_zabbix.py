@@ -66,7 +66,7 @@ def walk(plant: Plant, peer: Callable[[str], str]) -> Walk:
         options = ("-v", "2c", "-c", COMMUNITY, "-m", "", "-Onxt", f"udp:127.0.0.1:{plant.port}")
         _, output = await run_tool(peer("snmpbulkwalk"), *options, f".{oid}")
         found = {}
-        lines = re.sub(r"\n(?!\.)", " ", output)  # long texts go on in the next line
+        lines = re.sub(r"\n(?!\.)", " ", output.strip())  # long texts go on in the next line
         pattern = rf"^\.{re.escape(oid)}\.([\d.]+) = (?:([\w-]+): )?(.*)$"
         for index, kind, text in re.findall(pattern, lines, re.MULTILINE):
             found[index] = seen_by_zabbix.octets(bytes.fromhex(text)) if kind == "Hex-STRING" else text.strip('"')
