@@ -45,5 +45,5 @@ def test_no_delivered_file_holds_a_credential() -> None:
         if path.is_file():
             text = path.read_text(encoding="utf-8")
             for word in re.findall(r"(?:community|password)\"?:? *=? *\"([^\"]+)\"", text):
-                assert word == "CHANGE-ME", path
+                assert word.startswith("CHANGE-"), path
             assert not re.search(r"\b(public|private)\b", text) or path.suffix == ".md", path
