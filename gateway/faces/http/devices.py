@@ -142,8 +142,8 @@ class _DeviceLines:
     def __init__(self, device: Device, labels: bytes, plan: _Plan, families: int) -> None:
         self.device = device
         self.labels = labels
-        self._closed = labels + b"}"
         self._plan = plan
+        self._begins = tuple(begin + labels + b"}" for begin in plan.begins)
         self._values: list[Value | None] = [None] * len(plan.points)
         self._lines: Lines = (b"",) * families
         self._written: Snapshot | None = None
@@ -157,16 +157,16 @@ class _DeviceLines:
         before = self._written
         if before is None or _status(before) != _status(snapshot):
             lines[: len(DEVICE_METRICS)] = _status_lines(self.labels, snapshot)
-        plan, closed = self._plan, self._closed
+        plan = self._plan
         values = list(map(snapshot.shown().get, plan.points))
-        columns = (values, self._values, plan.families, plan.begins, plan.scales, plan.writers)
+        columns = (values, self._values, plan.families, self._begins, plan.scales, plan.writers)
         # The one loop that runs for every value of every device: tens of thousands of times a scrape.
         for value, old, family, begin, scale, writer in zip(*columns, strict=True):
             if value != old:
                 if value is None:
                     lines[family] = b""
                 elif writer is None:
-                    lines[family] = begin + closed + number(value * scale)
+                    lines[family] = begin + number(value * scale)
                 else:
                     lines[family] = writer.lines(self.labels, value)
         self._values = values

@@ -9,7 +9,6 @@ Rule 2: the reply goes out in pieces of about `PIECE_BYTES`, each compressed in 
 from __future__ import annotations
 
 import asyncio
-import zlib
 from collections.abc import AsyncIterator, Iterator
 
 from prometheus_client import CollectorRegistry, GCCollector, ProcessCollector
@@ -21,12 +20,11 @@ from gateway.core.site import Site
 from gateway.faces.http.devices import DeviceMetrics
 from gateway.faces.http.metric import MetricInfo
 from gateway.faces.http.own import Counts, OwnMetrics
+from gateway.faces.http.packing import packer
 from gateway.faces.http.text import Format, Lines, header
 
 DEVICES_A_TURN = 8
 PIECE_BYTES = 256 * 1024
-_GZIP_LEVEL = 1  # a tenth of the size already; higher levels cost the loop more time than they save
-_GZIP_WINDOW = 31  # zlib's way to ask for a gzip header
 
 
 class Exposition:
@@ -83,11 +81,11 @@ class Exposition:
 
 async def compressed(pieces: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
     """The pieces as one gzip stream, each compressed before the next is made."""
-    packer = zlib.compressobj(_GZIP_LEVEL, zlib.DEFLATED, _GZIP_WINDOW)
+    stream = packer()
     async for piece in pieces:
         for at in range(0, len(piece), PIECE_BYTES):
-            packed = packer.compress(memoryview(piece)[at : at + PIECE_BYTES])
+            packed = stream.compress(memoryview(piece)[at : at + PIECE_BYTES])
             if packed:
                 yield packed
             await asyncio.sleep(0)
-    yield packer.flush()
+    yield stream.flush()

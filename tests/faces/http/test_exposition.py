@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import gzip
+import sys
+import zlib
 from collections import Counter
 from dataclasses import replace
 
@@ -19,6 +20,7 @@ from gateway.core.stats import DeviceHistoryStats, HistoryStats, ModbusServerSta
 from gateway.devices.schema import load_map, models
 from gateway.faces.http.exposition import DEVICES_A_TURN, PIECE_BYTES, Exposition, compressed
 from gateway.faces.http.own import Counts, HttpStats
+from gateway.faces.http.packing import packer
 from gateway.faces.http.text import OPENMETRICS, TEXT, Format
 from tests.faces.http.reference import registry
 from tests.faces.http.scrapes import Seen, joined, parse, scrape, seen
@@ -177,11 +179,18 @@ async def test_a_poll_during_a_scrape_changes_nothing_of_it(clock: ManualClock) 
     assert [value for (name, _), value in again.items() if name == "morningstar_hourmeter_seconds_total"] == [0.0] * 100
 
 
-async def test_gzip_in_pieces_is_one_stream(clock: ManualClock) -> None:
+@pytest.mark.parametrize("library", ["ISA-L", "zlib"])
+async def test_gzip_in_pieces_is_one_stream(clock: ManualClock, library: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if library == "ISA-L":
+        pytest.importorskip("isal")
+    else:
+        monkeypatch.setitem(sys.modules, "isal.isal_zlib", None)
+    assert isinstance(packer(), type(zlib.compressobj())) is (library == "zlib")
     exposition = Exposition(large_site(clock, 30), clock, Counts())
-    packed = [piece async for piece in compressed(exposition.pieces(TEXT))]
-    assert len(packed) > 2
-    whole = gzip.decompress(b"".join(packed))
+    stream = zlib.decompressobj(wbits=31)
+    whole = b"".join([stream.decompress(piece) async for piece in compressed(exposition.pieces(TEXT))])
+    assert (stream.eof, stream.unused_data) == (True, b"")
+    assert len(whole) > 3 * PIECE_BYTES
     assert seen(parse(whole)).keys() == seen(parse(await joined(exposition.pieces(TEXT)))).keys()
 
 
