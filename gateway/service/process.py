@@ -20,6 +20,7 @@ from gateway import __version__
 from gateway.clock import SystemClock
 from gateway.service.advice import advice
 from gateway.service.config import Config
+from gateway.service.garbage import set_aside
 from gateway.service.gateway import Gateway
 from gateway.service.reload import Reloader
 from gateway.service.settings import line_budgets
@@ -73,6 +74,7 @@ async def _serve(path: Path, config: Config) -> int:
 async def _announce(gateway: Gateway, systemd: Systemd) -> None:
     """Say that the start is over: everything that listens does so, or was tried."""
     await gateway.supervisor.settled()
+    set_aside()
     systemd.ready(gateway.summary())
 
 

@@ -22,6 +22,7 @@ from gateway.core.stats import ServiceStats
 from gateway.errors import ConfigError
 from gateway.service.changes import NEEDS_RESTART, changes
 from gateway.service.config import load_config
+from gateway.service.garbage import set_aside
 from gateway.service.gateway import Gateway
 from gateway.service.systemd import Systemd
 
@@ -80,6 +81,7 @@ class Reloader:
         self._stats.reloads["applied"] += 1
         self._stats.configured_at = self._clock.wall()
         self._stats.reload_works = True
+        set_aside()
         changed = changes(before, config)
         _log.info('event=reloaded changed="%s" took_s=%.3f', _some(changed), self._clock.monotonic() - began)
 

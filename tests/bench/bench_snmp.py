@@ -7,7 +7,9 @@ The servers run one after the other in every round, on one core (the others are 
 run, so the generator only sends them: GET of every cell, GETNEXT of every cell, GETBULK from every 50th cell, which
 together is a walk. SNMPv3 is authPriv with SHA-256 and AES-128. One reply a run is read and checked whole here.
 
-Then Modbus TCP's latency, alone and while the table is walked without a pause.
+Then the longest CPU time for which the SNMP face held the event loop, while its whole tree (every table, not only
+the 80 columns) is walked by GETBULK-50 from one OID to the next, the first time and again; and Modbus TCP's latency,
+alone and while the 80 columns are walked without a pause.
 """
 
 from __future__ import annotations
@@ -146,8 +148,8 @@ class Asker:
             return self.sealed(self.user, 7, pdu, number)
         return wire.tlv(0x30, wire.integer(0x02, question.version) + wire.tlv(0x04, b"public") + pdu)
 
-    def varbinds(self, reply: bytes) -> int:
-        """How many varbinds an authentic and errorless reply has."""
+    def varbinds(self, reply: bytes) -> list[bytes]:
+        """The contents of the varbinds of an authentic and errorless reply."""
         version, _, at = reader.version(reply)
         if version == reader.VERSION_3:
             message = self._message(reply)
@@ -168,11 +170,11 @@ class Asker:
         _, at = reader.integer(reply, at, end)
         at, _ = reader.content(reply, at, end, 0x30)
         assert status == 0, f"error-status {status}"
-        count = 0
+        found = []
         while at < end:
-            _, at = reader.content(reply, at, end, 0x30)
-            count += 1
-        return count
+            first, at = reader.content(reply, at, end, 0x30)
+            found.append(reply[first:at])
+        return found
 
     @staticmethod
     def _message(data: bytes) -> v3.Message:
@@ -217,7 +219,9 @@ def started(name: str, folder: Path, core: int) -> Server:
         loop = name.rpartition(" ")[2]
         command = [sys.executable, "-m", "tests.bench.snmp_server", str(port), str(modbus_port), loop]
         cells = gateway_cells()
-    process = subprocess.Popen(["taskset", "-c", str(core), *command], env=environment, cwd=HERE.parents[1])
+    process = subprocess.Popen(
+        ["taskset", "-c", str(core), *command], env=environment, cwd=HERE.parents[1], stdout=subprocess.PIPE
+    )
     server = Server(name, process, port, modbus_port, cells)
     until = time.monotonic() + START_S
     with Asker(port) as asker:
@@ -251,7 +255,7 @@ def requests(question: Question, server: Server, path: Path) -> None:
             asker.sign_in()
         names = [wire.object_identifier(cell) for cell in server.cells[::step]]
         made = [asker.request(question, number, name) for number, name in enumerate(names, 0x01010101)]
-        found = asker.varbinds(asker.exchange(made[len(made) // 2]))
+        found = len(asker.varbinds(asker.exchange(made[len(made) // 2])))
     assert found == (1 if step == 1 else found) and found >= step * 0.6, f"{found} varbinds"  # noqa: PT018
     path.write_bytes(b"".join(len(each).to_bytes(2) + each for each in made))
 
@@ -301,6 +305,32 @@ def table(runs: dict[str, list[Run]]) -> str:
     return "\n".join(lines)
 
 
+def longest_turn_ms(server: Server) -> float:
+    """The longest turn since this was last asked."""
+    assert server.process.stdout is not None
+    server.process.send_signal(signal.SIGUSR1)
+    return float(server.process.stdout.readline())
+
+
+def whole_walk(server: Server, question: Question) -> str:
+    """Walk everything there is, and tell how long the loop was held."""
+    longest_turn_ms(server)
+    name, cells, replies = wire.object_identifier((1, 3)), 0, 0
+    before = cpu_s(server.process.pid)
+    with Asker(server.port) as asker:
+        if question.version == reader.VERSION_3:
+            asker.sign_in()
+        while True:
+            found = asker.varbinds(asker.exchange(asker.request(question, replies + 1, name)))
+            replies += 1
+            if found[-1].endswith(wire.END_OF_MIB_VIEW):
+                break
+            cells += len(found)
+            name = found[-1][: 2 + found[-1][1]]
+    used = cpu_s(server.process.pid) - before
+    return f"| {question.name} | {cells:,} | {replies:,} | {used:.2f} | {longest_turn_ms(server):.2f} |"
+
+
 def beside_modbus(server: Server, folder: Path, rounds: int, seconds: float, core: int) -> str:
     """Modbus TCP latency of a server without and with a walk that never pauses: 16 clients, one request each."""
     load = compiled("modbus_load.c", folder)
@@ -333,6 +363,17 @@ def beside_modbus(server: Server, folder: Path, rounds: int, seconds: float, cor
     pairs = zip(found["alone"], found["during a walk"], strict=True)
     ratio = statistics.median(walked["p99_us"] / alone["p99_us"] for alone, walked in pairs)
     return "\n".join(lines) + f"\n\np99 during a walk ÷ alone: {ratio:.2f}"
+
+
+def beside(server: Server, folder: Path, options: argparse.Namespace, usable: Sequence[int]) -> None:
+    """What a walk does to others, printed."""
+    with awake(server):
+        say(f"\nA walk of the whole tree ({server.name})\n")
+        say("| walk | cells | replies | CPU s | longest turn, CPU ms |\n|---|---|---|---|---|")
+        for question in (QUESTIONS[2], QUESTIONS[2], QUESTIONS[4]):
+            say(whole_walk(server, question))
+        say(f"\nModbus TCP beside a walk ({server.name}), 16 clients\n")
+        say(beside_modbus(server, folder, options.rounds, options.seconds, usable[-1]))
 
 
 def main() -> None:
@@ -380,12 +421,10 @@ def main() -> None:
                     with awake(server):
                         runs[server.name].append(measure(command, question, server, folder / "requests"))
             say(f"\n{question.name}\n\n{table(runs)}")
-        if options.only:
-            return
-        own = servers[len(servers) - 1 - (REFERENCE in names)]
-        with awake(own):
-            say(f"\nModbus TCP beside it ({own.name}), 16 clients\n")
-            say(beside_modbus(own, folder, options.rounds, options.seconds, usable[-1]))
+        if not options.only:
+            beside(
+                servers[names.index("gateway, uvloop") if "gateway, uvloop" in names else 0], folder, options, usable
+            )
 
 
 if __name__ == "__main__":

@@ -154,7 +154,7 @@ int main(int argc, char **argv)
         send(fds[i].fd, requests[under_way[i]].data, requests[under_way[i]].size, 0);
     }
     while ((t = now()) < until) {
-        poll(fds, sockets, 100);
+        poll(fds, sockets, 0);
         t = now();
         for (i = 0; i < sockets; i++) {
             struct request *one = &requests[under_way[i]];

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -163,3 +164,14 @@ async def test_a_mistake_in_the_middle_of_a_change_ends_the_process_for_a_new_st
     await gateway.run(asyncio.Event())
     assert gateway.supervisor.beyond_help == "reload"
     assert 'event=task_failed task="reload"' in caplog.text
+
+
+async def test_what_a_reload_made_is_set_aside_from_the_collector(site: Site) -> None:
+    path = site.folder / "site.toml"
+    path.write_text(site.text(A, B, FACES))
+    async with running(site.config(A, FACES)) as gateway:
+        gc.unfreeze()
+        await Reloader(path, gateway, SystemClock(), Systemd({}))._reload(0.0)
+        assert list(gateway.site.by_unit) == [11, 12]
+        assert gc.get_freeze_count() > 10_000
+        gc.unfreeze()
