@@ -31,12 +31,16 @@ from rich.live import Live
 from gateway.cli.children import last_lines, start_gateway_command, stop_all
 from gateway.cli.demo_commands import COMMUNITY, Try, commands_to_try
 from gateway.cli.demo_screen import commands_text, fitting, plain_lines
-from gateway.cli.demo_view import MODEL, Rates, View, read_view
+from gateway.cli.demo_view import Rates, View, read_view
 from gateway.cli.stopping import Stop
 
 HOST = "127.0.0.1"
-LAYOUT = {"shelter-a": (("array-1", 1, 11), ("array-2", 2, 12)), "shelter-b": (("array-3", 1, 13),)}
-"""Line → its controllers as (name, address, unit id): `simulate`'s own layout, two of them at the factory address."""
+PROSTAR, TRISTAR = "prostar-mppt", "tristar-mppt"
+LAYOUT = {
+    "shelter-a": (("array-1", 1, 11, PROSTAR), ("array-2", 2, 12, PROSTAR)),
+    "shelter-b": (("array-3", 1, 13, PROSTAR), ("array-4", 2, 14, TRISTAR)),
+}
+"""Line → its controllers as (name, address, unit id, model): `simulate`'s own layout, two at the factory address."""
 
 SIMULATION = ("--speed", "120", "--start-hour", "8")
 """A day in twelve minutes, from the morning on."""
@@ -64,7 +68,7 @@ def command(
     snmp_port: Annotated[int, typer.Option(min=1, max=65535, help="UDP port of the SNMP face.")] = 1161,
     http_port: Annotated[int, typer.Option(min=1, max=65535, help="TCP port of the HTTP face.")] = 9850,
 ) -> None:
-    """Run three simulated controllers on two serial lines, the gateway and its three faces, and watch them."""
+    """Run four simulated controllers on two serial lines, the gateway and its three faces, and watch them."""
     stop = Stop((signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
     console = Console()
     ports = Ports(modbus_port, snmp_port, http_port)
@@ -175,8 +179,8 @@ def demo_config(folder: Path, ports: Ports) -> str:
     text = f'site = "demo"\nstate_dir = "{folder}"\n'
     for line, devices in LAYOUT.items():
         text += f'\n[[line]]\nname = "{line}"\nport = "{folder / line}"\n'
-        for name, address, unit in devices:
-            text += f'[[line.device]]\nname = "{name}"\naddress = {address}\nunit_id = {unit}\nmodel = "{MODEL}"\n'
+        for name, address, unit, model in devices:
+            text += f'[[line.device]]\nname = "{name}"\naddress = {address}\nunit_id = {unit}\nmodel = "{model}"\n'
     text += f'\n[modbus]\nlisten = ["{HOST}:{ports.modbus}"]\n\n[snmp]\nlisten = ["{HOST}:{ports.snmp}"]\n'
     text += f'[[snmp.community]]\nname = "{COMMUNITY}"\nsource = ["127.0.0.0/8"]\n'
     return text + f'\n[http]\nlisten = ["{HOST}:{ports.http}"]\n'

@@ -22,12 +22,14 @@ _NONE = "–"
 
 def fitting(view: View, rates: Mapping[str, float], commands: Sequence[Try], console: Console) -> Group:
     """The live picture, with as much around the commands as the terminal has room for."""
-    tables = [_devices(view.devices), _lines(view.lines, rates)]
-    for labels in (True, False):
+    wide, narrow = (
+        (_devices(view.devices, edges=edges), _lines(view.lines, rates, edges=edges)) for edges in (True, False)
+    )
+    for tables, labels in ((wide, True), (wide, False), (narrow, False)):
         picture = Group(*tables, commands_text(commands, labels=labels))
         if len(console.render_lines(picture)) < console.height:
             return picture
-    return Group(commands_text(commands, labels=False), *tables)
+    return Group(commands_text(commands, labels=False), *narrow)
 
 
 def commands_text(commands: Sequence[Try], *, labels: bool) -> Text:
@@ -67,9 +69,12 @@ _PAIRS = {
     "load": (("load_voltage", "V", 2), ("load_current", "A", 1)),
 }
 
+_INSTEAD = {"battery_current_net": "charge_current"}
+"""What a model without a load output says of the battery."""
 
-def _devices(devices: Sequence[DeviceView]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+
+def _devices(devices: Sequence[DeviceView], *, edges: bool) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=edges)
     table.add_column("unit", justify="right", no_wrap=True)
     table.add_column("device\nline", overflow="ellipsis", no_wrap=True, min_width=9)
     for heading in ("battery", "array", "load"):
@@ -89,8 +94,8 @@ def _devices(devices: Sequence[DeviceView]) -> Table:
     return table
 
 
-def _lines(lines: Sequence[LineView], rates: Mapping[str, float]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
+def _lines(lines: Sequence[LineView], rates: Mapping[str, float], *, edges: bool) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, show_edge=edges)
     table.add_column("line", overflow="ellipsis")
     for heading in ("port", "use", "requests/s", "errors"):
         table.add_column(heading, justify="right", no_wrap=True)
@@ -110,6 +115,8 @@ def _pair(device: DeviceView, name: str) -> str:
 
 def _number(device: DeviceView, point: str, unit: str, digits: int) -> str:
     value = device.numbers.get(point)
+    if value is None and point in _INSTEAD:
+        value = device.numbers.get(_INSTEAD[point])
     return _NONE if value is None else f"{value:.{digits}f} {unit}"
 
 

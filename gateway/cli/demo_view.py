@@ -1,7 +1,7 @@
 """What the demo shows, taken from a scrape of the gateway's own /metrics.
 
 The demo sees what Prometheus sees: a value that the gateway withholds is a dash here. Metric names come from the
-map, so that this file knows points, not spellings.
+maps, so that this file knows points, not spellings.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from prometheus_client.parser import text_string_to_metric_families
 from prometheus_client.samples import Sample
 
-from gateway.devices.schema import load_map
+from gateway.devices.agreement import all_maps
 
-MODEL = "prostar-mppt"
 NUMBERS = (
     "battery_voltage",
     "battery_current_net",
+    "charge_current",
     "array_voltage",
     "charge_power",
     "load_voltage",
@@ -73,8 +73,8 @@ def read_view(scrape: str) -> View:
     for family in text_string_to_metric_families(scrape):
         for sample in family.samples:
             samples.setdefault(sample.name, []).append(sample)
-    device_map = load_map(MODEL)
-    metrics = {name: device_map.point(name).metric or "" for name in (*NUMBERS, *STATES)}
+    points = {point.name: point for device_map in all_maps() for point in device_map.points}
+    metrics = {name: points[name].metric or "" for name in (*NUMBERS, *STATES)}
     devices = [
         DeviceView(
             unit_id=int(unit),

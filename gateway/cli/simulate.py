@@ -6,6 +6,7 @@ import asyncio
 import json
 import signal
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +16,9 @@ from rich.console import Console
 from rich.table import Table
 
 from gateway.devices.schema import load_map
+from gateway.errors import MapError
 from gateway.simulator.layout import DEMO_LAYOUT, Behaviour, LinePlan, SimulatedSite
+from gateway.simulator.server import Controller
 
 MODEL = "prostar-mppt"
 
@@ -26,9 +29,9 @@ def command(
         list[str] | None,
         typer.Option(
             "--line",
-            metavar="NAME=ADDR,ADDR",
-            help="A line and the addresses of its controllers; repeat for more lines. "
-            "Default: shelter-a=1,2 and shelter-b=1.",
+            metavar="NAME=ADDR,ADDR:MODEL",
+            help="A line and the addresses of its controllers, with their model if it is another than --model; repeat "
+            "for more lines. Default: shelter-a=1,2 and shelter-b=1,2:tristar-mppt.",
         ),
     ] = None,
     lines: Annotated[
@@ -46,14 +49,15 @@ def command(
     oracle: Annotated[
         bool, typer.Option("--oracle", help="Registers that encode device and address, instead of a solar day.")
     ] = False,
+    model: Annotated[str, typer.Option(help="Model of the controllers for which none is named.")] = MODEL,
     as_json: Annotated[bool, typer.Option("--json", help="Print one line of JSON instead of a table.")] = False,
 ) -> None:
-    """Run simulated ProStar MPPT controllers on ptys paced at 9600 8N2 and print where they are."""
+    """Run simulated controllers on ptys paced at 9600 8N2 and print where they are."""
     try:
         plans = _plans(line, lines, devices)
         behaviour = Behaviour(seed, speed, start_hour, turnaround_ms / 1000, oracle)
-        site = SimulatedSite.build(load_map(MODEL), plans, behaviour, link_dir)
-    except ValueError as error:
+        site = SimulatedSite.build(load_map(model), plans, behaviour, link_dir)
+    except (ValueError, MapError) as error:
         raise typer.BadParameter(str(error)) from error
     try:
         asyncio.run(_run(site, as_json))
@@ -100,11 +104,19 @@ def _sum_up(site: SimulatedSite, elapsed_s: float) -> None:
 
 
 def _announce(site: SimulatedSite, as_json: bool) -> None:
-    """Tell the paths: a table for people, or one line `{"lines": [{"name", "port", "addresses"}]}` for programs."""
+    """Tell the paths: a table for people, or one line of JSON for programs.
+
+    It is `{"lines": [{"name", "port", "addresses", "models"}]}`, addresses and models in the same order.
+    """
     if as_json:
         listed = [
-            {"name": plan.name, "port": line.path, "addresses": list(plan.addresses)}
-            for plan, line in zip(site.plans, site.lines, strict=True)
+            {
+                "name": plan.name,
+                "port": line.path,
+                "addresses": list(plan.addresses),
+                "models": [unit.map.model for unit in _units(site, number)],
+            }
+            for number, (plan, line) in enumerate(zip(site.plans, site.lines, strict=True))
         ]
         print(json.dumps({"lines": listed}), flush=True)
         return
@@ -112,10 +124,20 @@ def _announce(site: SimulatedSite, as_json: bool) -> None:
     for heading in ("line", "port", "addresses"):
         table.add_column(heading)
     for plan, line in zip(site.plans, site.lines, strict=True):
-        table.add_row(plan.name, line.path, ", ".join(str(address) for address in plan.addresses))
+        units = (
+            f"{address}:{plan.models[address]}" if address in plan.models else str(address)
+            for address in plan.addresses
+        )
+        table.add_row(plan.name, line.path, ", ".join(units))
     console = Console()
     console.print(table)
     address, path = site.plans[0].addresses[0], site.lines[0].path
     example = f"mbpoll -m rtu -b 9600 -P none -s 2 -a {address} -t 4:hex -0 -r 0 -c 82 -1 {path}"
     console.print(f"Try: {example}", markup=False, soft_wrap=True, highlight=False)
     console.print("Ctrl-C ends it.")
+
+
+def _units(site: SimulatedSite, number: int) -> Sequence[Controller]:
+    """The controllers of a line."""
+    before = sum(len(plan.addresses) for plan in site.plans[:number])
+    return site.controllers[before : before + len(site.plans[number].addresses)]

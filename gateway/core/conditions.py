@@ -1,8 +1,8 @@
 """Conditions: everything that can be wrong with a controller, a line or the gateway, each with its state at any moment.
 
 Rule 1: the list is fixed by the configuration and the maps, so that a row about each of them is always there. Codes
-        are for ever: 100, 200, 300 + the number of a bit (as its map says), 401 to 449 of a device, 451 to 499 of the
-        gateway, 1000 + the index of a line.
+        are for ever and mean one thing on all models: 100, 200, 300, 500, 600 + the number of a bit (as its map says),
+        401 to 449 of a device, 451 to 499 of the gateway, 1000 + the index of a line.
 Rule 2: a condition is raised, clear or unknown. Of a device that is not online nobody knows its faults and alarms.
 Rule 3: it is counted when it is raised after it was clear or never known: not when a device that was away comes back
         with it.

@@ -1,13 +1,14 @@
 """What the engine keeps of one device, and how replies become snapshots.
 
 The parts (one a planned block) are merged into a new immutable `Snapshot` after each poll. A value is
-always decoded from one read, and carries the time at which that read's request went out.
+always decoded from one read, and carries the time at which that read's request went out. The scaling of a device that
+tells its own may come from another read; when it turns out to be another one, everything is decoded anew.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from gateway.core.doubt import Doubt
@@ -20,6 +21,15 @@ from gateway.devices.decode import Decoder
 from gateway.devices.model import Identification, Space, Value
 
 PartKey = tuple[Space, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """A block as it was read, and what it says."""
+
+    block: Block
+    values: Mapping[str, Value]
+    texts: Mapping[str, str]
 
 
 class DeviceRecord:
@@ -35,7 +45,8 @@ class DeviceRecord:
         self.live_started_at: float | None = None
         self.doubt = Doubt()
         self._decoder = Decoder(device.map, device.decode)
-        self._parts: dict[PartKey, tuple[Block, dict[str, Value]]] = {}
+        self._parts: dict[PartKey, _Part] = {}
+        self._scaling: dict[str, Value] = {}  # what the device last told of it, since the line was opened
         device.snapshot = Snapshot(state_since=now)
 
     @property
@@ -75,9 +86,13 @@ class DeviceRecord:
 
     def store(self, block: Block, now: float) -> None:
         """Take in a block that was read by a poll and publish a new snapshot."""
-        values = self._decoder.decode(block.space, block.first, block.data, block.count)
+        part = self._decoded(block)
+        self._parts[(block.space, block.first, block.count)] = part
+        told = {name: part.values[name] for name in self._decoder.factors if name in part.values}
+        if told.items() - self._scaling.items():
+            self._scaling.update(told)
+            self._parts = {key: self._decoded(each.block) for key, each in self._parts.items()}
         self.device.stats.implausible = self._decoder.implausible
-        self._parts[(block.space, block.first, block.count)] = (block, values)
         self._merge(last_reply_at=now)
 
     def forget(self, space: Space, first: int, end: int) -> None:
@@ -94,15 +109,16 @@ class DeviceRecord:
         """Read Device Identification was answered."""
         self._publish(last_reply_at=now, identification=identification)
 
-    def numbered(self, serial_number: str, now: float) -> None:
-        """The serial number was read."""
-        self._publish(last_reply_at=now, serial_number=serial_number or None)
+    def numbered(self, serial_number: str | None, now: float) -> None:
+        """The serial number was read; None when there was nothing readable."""
+        self._publish(last_reply_at=now, serial_number=serial_number)
 
     def restart(self) -> None:
         """Another unit may stand there now: nothing of the old one is kept but what is known of its identity."""
         self.verified = False
         self.live_started_at = None
         self._parts.clear()
+        self._scaling.clear()
         self._publish(identification=None, serial_number=None)
 
     def warn(self, warning: str, *, on: bool) -> bool:
@@ -122,16 +138,26 @@ class DeviceRecord:
 
     def _merge(self, **changes: object) -> None:
         merged: dict[str, Value] = {}
+        texts: dict[str, str] = {}
         read_at: dict[str, float] = {}
-        for part, values in self._parts.values():
-            merged.update(values)
-            read_at.update(dict.fromkeys(values, part.read_at))
+        for part in self._parts.values():
+            merged.update(part.values)
+            read_at.update(dict.fromkeys(part.values, part.block.read_at))
+            if part.texts:
+                texts.update(part.texts)
+                read_at.update(dict.fromkeys(part.texts, part.block.read_at))
         self._publish(
-            blocks=tuple(part for part, _ in self._parts.values()),
+            blocks=tuple(part.block for part in self._parts.values()),
             values=MappingProxyType(merged),
+            texts=MappingProxyType(texts),
             read_at=MappingProxyType(read_at),
             **changes,
         )
+
+    def _decoded(self, block: Block) -> _Part:
+        decode = self._decoder
+        values = decode.decode(block.space, block.first, block.data, block.count, self._scaling)
+        return _Part(block, values, decode.texts(block.space, block.first, block.data))
 
     def _publish(self, **changes: object) -> None:
         old = self.device.snapshot

@@ -420,7 +420,8 @@ class LineEngine:
         point = _written_point(turn.device, turn.pdu)
         if point is None or point.rewrite_s is None:
             return
-        if any(turn.pdu[3:5]):
+        held = point.released.held_by(int.from_bytes(turn.pdu[3:5], "big"), held=point.name in record.rewrites)
+        if held:
             record.rewrites[point.name] = now
         else:
             record.rewrites.pop(point.name, None)

@@ -107,7 +107,8 @@ def plan(pdu: bytes, rules: WriteRules, requester: Requester, id_: str) -> Job |
         return Refusal(_WRITE_NOT_ALLOWED, IllegalFunction("not allowed"))
     try:
         for write, point in zip(writes, points, strict=True):
-            check_value(point, write.value, device.map, device.decode.get(point.name))
+            reading = device.decode.get(point.name)
+            check_value(point, write.value, device.map, reading, device.snapshot.values)
     except IllegalDataValue as error:
         return Refusal(_WRITE_VALUE, error)
     parts = tuple(Part(write, point, device.map.wears(point)) for write, point in zip(writes, points, strict=True))

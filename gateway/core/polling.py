@@ -9,7 +9,8 @@ Rule 3: a device is online once each of its live blocks was read since the line 
         breaker opens until it is online again.
 Rule 4: a unit that is not the expected one is not shown and not asked for anybody; it is looked at again
         every minute.
-Rule 5: a value that must be written again and again is warned about after three quarters of its time.
+Rule 5: blocks that the unit's product does not have, by its map, are not asked for once it told its product.
+Rule 6: a value that must be written again and again is warned about after three quarters of its time.
         It is never written by the gateway itself.
 """
 
@@ -26,6 +27,7 @@ from gateway.core.site import Device
 from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN, Block, DeviceState
 from gateway.devices.model import Identification, PollClass, Space
 from gateway.devices.plan import PlannedBlock, poll_plan, split
+from gateway.devices.texts import decode_text
 from gateway.modbus.pdu import Function, ReadRequest, parse_identification, read_identification_request
 from gateway.modbus.rtu import Replied
 
@@ -112,10 +114,12 @@ class Polling:
             record.polls.items.remove(item)
             objects = parse_identification(event.pdu).objects
             texts = (objects.get(number, b"").decode("ascii", "replace").strip("\0 ") for number in range(3))
-            record.identified(Identification(*texts), now)
+            identification = Identification(*texts)
+            record.identified(identification, now)
+            self._keep_what_it_has(record, identification.product)
         else:
             record.polls.items.remove(item)
-            record.numbered(_printable(event.pdu[2:]), now)
+            record.numbered(decode_text("ascii", event.pdu[2:], item.device.map.identity.serial_order), now)
 
     def refused(self, item: PollItem, record: DeviceRecord, code: int, now: float) -> None:
         """The device answered a poll with an exception (rule 2)."""
@@ -178,7 +182,7 @@ class Polling:
         return DeviceState.ONLINE
 
     def watch_rewrites(self, record: DeviceRecord, now: float) -> None:
-        """Raise or clear the warning of rule 5."""
+        """Raise or clear the warning of rule 6."""
         late = False
         for name, written_at in record.rewrites.items():
             rewrite_s = record.device.map.point(name).rewrite_s
@@ -207,6 +211,17 @@ class Polling:
             record.known = record.known.learned(record.seen())
         return record.verified
 
+    def _keep_what_it_has(self, record: DeviceRecord, product: str) -> None:
+        """Rule 5."""
+        device_map = record.device.map
+        lacking = [extent for extent in device_map.extents if not device_map.on_product(extent, product)]
+        for item in [item for item in record.polls.items if item.block is not None]:
+            block = item.block
+            assert block is not None
+            if any(e.space is block.space and e.first <= block.first <= e.last for e in lacking):
+                record.polls.items.remove(item)
+                record.forget(block.space, block.first, block.last + 1)
+
     def _once(self, device: Device, now: float) -> list[PollItem]:
         """What is asked once after each start: who are you."""
         items = [PollItem(device, Purpose.IDENTIFY, read_identification_request(), None, None, now)]
@@ -231,9 +246,3 @@ def _rank(item: PollItem) -> int:
     if item.block is None:
         return 1
     return 0 if item.block.poll is PollClass.LIVE else 2
-
-
-def _printable(words: bytes) -> str:
-    """Registers as ASCII text; "" when they hold anything else (the number is undocumented)."""
-    text = words.strip(b"\0\xff ")
-    return text.decode("ascii") if text.isascii() and text.decode("ascii", "replace").isprintable() else ""

@@ -40,6 +40,7 @@ class Block:
 
 
 _NO_VALUES: Mapping[str, Value] = MappingProxyType({})
+_NO_TEXTS: Mapping[str, str] = MappingProxyType({})
 _NO_TIMES: Mapping[str, float] = MappingProxyType({})
 
 
@@ -47,7 +48,7 @@ _NO_TIMES: Mapping[str, float] = MappingProxyType({})
 class Snapshot:
     """State and last values of a device.
 
-    `values` has only points that have a value (NaN, infinity and absent sensors are left out) and is kept
+    `values` and `texts` have only points that have a value (NaN, infinity and absent sensors are left out) and is kept
     while the device is stale so that a `hold` policy is possible; faces use `shown()`.
     """
 
@@ -57,6 +58,7 @@ class Snapshot:
     last_reply_at: float | None = None
     blocks: tuple[Block, ...] = ()
     values: Mapping[str, Value] = field(default_factory=lambda: _NO_VALUES)
+    texts: Mapping[str, str] = field(default_factory=lambda: _NO_TEXTS)  # the points that are texts
     read_at: Mapping[str, float] = field(default_factory=lambda: _NO_TIMES)  # point name → its block's read_at
     identification: Identification | None = None
     serial_number: str | None = None
@@ -73,6 +75,10 @@ class Snapshot:
             if block.space is point.space and block.first <= point.address and end <= block.first + block.count:
                 return block
         return None
+
+    def shown_texts(self) -> Mapping[str, str]:
+        """As `shown`, of the points that are texts."""
+        return self.texts if self.state is DeviceState.ONLINE else _NO_TEXTS
 
     def age_s(self, point: str, now: float) -> float | None:
         """Age of a point's value in seconds, or None when it was never read."""

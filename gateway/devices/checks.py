@@ -12,8 +12,25 @@ from itertools import pairwise
 
 from gateway.devices.codecs import CODECS
 from gateway.devices.log import HOURMETER
-from gateway.devices.model import Access, DeviceMap, Emc1Form, Extent, Group, LogLayout, Point, PollClass, Space
-from gateway.devices.units import UNITS, metric_name
+from gateway.devices.model import (
+    Access,
+    DeviceMap,
+    Emc1Form,
+    Extent,
+    Group,
+    Kind,
+    LogLayout,
+    Point,
+    PollClass,
+    Reading,
+    Released,
+    Space,
+)
+from gateway.devices.texts import TEXT_CODECS
+from gateway.devices.units import UNITS, info_name, metric_name
+
+GATEWAYS_OWN = 400
+"""Condition codes from here to 499 are what the gateway sees itself (core/conditions.py)."""
 
 _STATE_CODECS = frozenset({"enum", "flag", "coil"})
 _KNOWN_READ_FUNCTIONS = {1: Space.COILS, 2: Space.COILS, 3: Space.REGISTERS, 4: Space.REGISTERS}
@@ -53,6 +70,9 @@ def _extents(device_map: DeviceMap) -> Iterator[str]:
         for one, two in pairwise(ordered):
             if one.space is two.space and two.first <= one.last:
                 yield f"{what} {two.name}: overlaps {one.name} at 0x{two.first:04X}"
+    for extent in device_map.extents:
+        for product in set(extent.products) - set(device_map.identity.product_codes):
+            yield f"extent {extent.name}: products: {product} is none of the product codes"
     for run in device_map.reserved:
         if _extent_of(device_map, run.space, run.first, run.last) is None:
             yield f"reserved {run.name}: 0x{run.first:04X}..0x{run.last:04X} is outside all extents"
@@ -100,9 +120,13 @@ def _points(device_map: DeviceMap) -> Iterator[str]:
 def _readings(point: Point) -> Iterator[str]:
     yield from _doubles([reading.name for reading in point.readings], "reading")
     for reading in point.readings:
+        if reading.codec in TEXT_CODECS:
+            yield from _text_reading(point, reading)
+            continue
         codec = CODECS.get(reading.codec)
-        if codec is None:
-            yield f"reading {reading.name}: unknown codec {reading.codec!r}; known: {', '.join(CODECS)}"
+        if codec is None or point.kind is Kind.TEXT:
+            known = TEXT_CODECS if point.kind is Kind.TEXT else (*CODECS, *TEXT_CODECS)
+            yield f"reading {reading.name}: unknown codec {reading.codec!r}; known: {', '.join(known)}"
             continue
         if codec.space is not point.space:
             yield f"reading {reading.name}: codec {codec.name} is for {codec.space.value}"
@@ -110,6 +134,33 @@ def _readings(point: Point) -> Iterator[str]:
             yield f"reading {reading.name}: codec {codec.name} does not fit {point.words} word(s)"
         if reading.scale <= 0:
             yield f"reading {reading.name}: scale must be above 0"
+
+
+def _text_reading(point: Point, reading: Reading) -> Iterator[str]:
+    codec = TEXT_CODECS[reading.codec]
+    if point.kind is not Kind.TEXT:
+        yield f"reading {reading.name}: codec {codec.name} gives text, the document's reading does not"
+    if point.space is not Space.REGISTERS:
+        yield f"reading {reading.name}: codec {codec.name} is for registers"
+    elif point.words not in codec.words:
+        yield f"reading {reading.name}: codec {codec.name} does not fit {point.words} word(s)"
+    if reading.scale != 1 or reading.factors or reading.absent:
+        yield f"reading {reading.name}: a text has no scale, nothing scales it and it has no absent numbers"
+
+
+def _factors(device_map: DeviceMap) -> Iterator[str]:
+    points = {point.name: point for point in device_map.points}
+    for point in device_map.points:
+        for reading in point.readings:
+            for name in reading.factors:
+                factor = points.get(name)
+                prefix = f"point {point.name}: reading {reading.name}: scaled_by: "
+                if factor is None:
+                    yield f"{prefix}no point {name}"
+                elif not factor.polled or factor.kind is not Kind.NUMBER or factor.space is not Space.REGISTERS:
+                    yield f"{prefix}{name} is no polled number"
+                elif any(each.factors for each in factor.readings):
+                    yield f"{prefix}{name} is itself scaled by a point"
 
 
 def _tables(point: Point, device_map: DeviceMap) -> Iterator[str]:
@@ -134,6 +185,8 @@ def _limits(point: Point) -> Iterator[str]:
         yield f"unknown unit {point.unit!r}; known: {', '.join(filter(None, UNITS))}"
     if point.minimum is not None and point.maximum is not None and point.minimum > point.maximum:
         yield "minimum is above maximum"
+    if point.kind is Kind.TEXT and (point.unit or point.plausible or point.access is not Access.READ):
+        yield "a text has no unit and no plausible bounds, and cannot be written"
     if point.access is not Access.WRITE and (point.minimum, point.maximum) != (None, None):
         yield "minimum and maximum are for what can be written"
     if point.access is Access.SET and (point.space is not Space.COILS or point.group is not Group.COMMAND):
@@ -157,6 +210,8 @@ def _rules(device_map: DeviceMap) -> Iterator[str]:
             False,
         ):
             yield f"point {point.name}: rewrite_s, restarts, named_only and wears are for what can be written"
+        if point.rewrite_s is None and point.released is not Released.BY_ZERO:
+            yield f"point {point.name}: released is for what must be rewritten"
         if point.restarts and not point.named_only:
             yield f"point {point.name}: what restarts the device is named_only"
 
@@ -172,8 +227,8 @@ def _conditions(device_map: DeviceMap) -> Iterator[str]:
             continue
         if point.bits is None or point.group is not Group.LIVE:
             yield f"point {point.name}: conditions: are for live bits"
-        if rule.first % 100:
-            yield f"point {point.name}: conditions: first {rule.first}; allowed: 100, 200, 300"
+        if rule.first % 100 or rule.first == GATEWAYS_OWN:
+            yield f"point {point.name}: conditions: first {rule.first}; allowed: 100, 200, 300, 500 to 900"
         if firsts.setdefault(rule.first, point.name) != point.name:
             yield f"point {point.name}: conditions: first {rule.first} belongs to {firsts[rule.first]}"
         if names.setdefault(rule.name, point.name) != point.name:
@@ -213,8 +268,8 @@ def _mib(device_map: DeviceMap) -> Iterator[str]:
         other = taken.setdefault((point.group, point.mib.column), point.name)
         if other != point.name:
             yield f"{prefix}column {point.mib.column} of table {point.group.value} belongs to {other}"
-        for syntax, table in (("Enumeration", point.enumeration), ("Bits", point.bits)):
-            if (point.mib.syntax == syntax) != (table is not None):
+        for syntax, kind in (("Enumeration", Kind.ENUMERATION), ("Bits", Kind.BITS), ("Text", Kind.TEXT)):
+            if (point.mib.syntax == syntax) != (point.kind is kind):
                 yield f"{prefix}syntax {point.mib.syntax} does not fit the point"
         unit = UNITS.get(point.unit)
         if unit is not None and unit.mib_units.get(point.mib.scale) != point.mib.units:
@@ -247,7 +302,9 @@ def _metrics(device_map: DeviceMap) -> Iterator[str]:
         if point.group is Group.COMMAND:
             yield f"point {point.name}: metric: group command has none"
         allowed = [metric_name(point.name, unit, counter=True)]
-        if not point.name.endswith("_total"):
+        if point.kind is Kind.TEXT:
+            allowed = [info_name(point.name)]
+        elif not point.name.endswith("_total"):
             allowed.append(metric_name(point.name, unit, counter=False))
         if point.metric not in allowed:
             yield f"point {point.name}: metric {point.metric}: must be {' or '.join(reversed(allowed))}"
@@ -297,6 +354,7 @@ _CHECKS: tuple[Callable[[DeviceMap], Iterator[str]], ...] = (
     _extents,
     _places,
     _points,
+    _factors,
     _rules,
     _conditions,
     _load,

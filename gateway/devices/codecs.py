@@ -1,6 +1,7 @@
 """Codecs: how the words of a point become a value and back.
 
-Rule 1: a codec knows nothing of a register; words, order and scale are arguments, the map has them.
+Rule 1: a codec knows nothing of a register; words, order and scale are arguments, the map has them. What the
+        device itself says of its scaling are values of other points: `known` to those who read by a whole reading.
 Rule 2: "no value" is `None`: NaN, infinity, a nibble that is no decimal digit. Never a substitute number.
 Rule 3: decode then encode gives the same value; encode refuses with ValueError what it cannot say exactly
         enough (out of range, not finite), it never wraps or clips.
@@ -16,11 +17,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from gateway.devices.model import Space, Value, WordOrder
+from gateway.devices.model import Reading, Space, Value, WordOrder
 
 _HALF = struct.Struct(">e")
 _WORD = struct.Struct(">H")
 _FIRST_NORMAL_HALF = 0x0400
+_NOTHING: Mapping[str, Value] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,8 +212,32 @@ def encode(codec: str, value: Value, n_words: int, order: WordOrder, scale: floa
     return separate(CODECS[codec].encode(unscaled, 16 * n_words), n_words, order)
 
 
-def ascii_text(words: Sequence[int]) -> str | None:
-    """Text of two characters a word, high byte first, padding cut; None when empty or not printable ASCII."""
-    data = b"".join(_WORD.pack(word) for word in words).rstrip(b"\x00 \xff")
-    text = data.decode("latin-1")
-    return text if text and text.isascii() and text.isprintable() else None
+def read_words(reading: Reading, words: Sequence[int], known: Mapping[str, Value] = _NOTHING) -> Value | None:
+    """The value of words in address order (one 0/1 for a coil) by a reading; None for "no value".
+
+    `known` has the values of the points that tell the scaling; while one of them is not known there is no value.
+    """
+    if combine(words, reading.order) in reading.absent:
+        return None
+    value = decode(reading.codec, words, reading.order, reading.scale)
+    factor = product_of(reading.factors, known)
+    return None if value is None or factor is None else value if not reading.factors else value * factor
+
+
+def write_words(reading: Reading, value: Value, n_words: int, known: Mapping[str, Value] = _NOTHING) -> tuple[int, ...]:
+    """The inverse of `read_words`, to the nearest step; ValueError if it cannot be said or the scaling is not known."""
+    factor = product_of(reading.factors, known)
+    if not factor:
+        raise ValueError(f"the scaling by {' and '.join(reading.factors)} is not known")
+    return encode(reading.codec, value / factor if reading.factors else value, n_words, reading.order, reading.scale)
+
+
+def product_of(factors: Sequence[str], known: Mapping[str, Value]) -> Value | None:
+    """The product of the values of these points, 1 of none; None while one of them is not known."""
+    product: Value = 1
+    for name in factors:
+        factor = known.get(name)
+        if factor is None:
+            return None
+        product *= factor
+    return product

@@ -4,9 +4,12 @@ Rule 1: a point is decoded only when all its words lie in the block, so a 32-bit
 Rule 2: "no value" (NaN, infinity, a broken digit) is left out, it has no substitute.
 Rule 3: a value outside the point's plausible bounds is left out too, and counted in `implausible`.
 Rule 4: commands are never decoded.
+Rule 5: a point that the device scales has no value until the points that tell the scaling have one; of the same
+        block if they lie in it, else as the caller knows them.
 
-What to do with a block is worked out once per block form and kept: two `struct` formats, one for the half
-floats and one for everything else, each naming exactly its points and skipping the bytes between.
+What to do with a block is worked out once per block form and kept: three `struct` formats, one for the half
+floats, one for what the device scales and one for everything else, each naming exactly its points and skipping the
+bytes between.
 """
 
 from __future__ import annotations
@@ -15,9 +18,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from struct import Struct
+from types import MappingProxyType
 
-from gateway.devices.codecs import CODECS, scaler
-from gateway.devices.model import DeviceMap, Point, Reading, Space, Value, WordOrder
+from gateway.devices.codecs import CODECS, product_of, scaler
+from gateway.devices.model import DeviceMap, Kind, Point, Reading, Space, Value, WordOrder
+from gateway.devices.texts import decode_text
 from gateway.errors import MapError
 
 _HALF_BOUNDS = (-65504.0, 65504.0)  # the finite halves: infinity is outside, NaN compares with nothing
@@ -25,6 +30,7 @@ _NO_BOUNDS = (-math.inf, math.inf)
 _MAX_FORMS = 64  # a device is polled in a handful of block forms; a caller with more only loses the cache
 
 _Convert = Callable[[int], Value | None]
+_NOTHING: Mapping[str, Value] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +41,9 @@ class _Form:
     half_points: tuple[tuple[str, float, float], ...]
     others: Struct
     other_points: tuple[tuple[str, _Convert | None, float, float], ...]
+    scaled: Struct
+    scaled_points: tuple[tuple[str, _Convert | None, float, float, tuple[str, ...]], ...]
+    texts: tuple[tuple[str, slice, Reading], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,38 +55,46 @@ class _Bound:
 
     @property
     def is_half(self) -> bool:
-        return self.reading.codec == "f16" and self.reading.scale == 1
+        plain = self.reading.scale == 1 and not self.reading.factors and not self.reading.absent
+        return self.reading.codec == "f16" and plain
 
     @property
     def bounds(self) -> tuple[float, float]:
         return self.point.plausible or (_HALF_BOUNDS if self.is_half else _NO_BOUNDS)
+
+    def slice_from(self, first: int) -> slice:
+        """Its bytes in a block that begins at `first`."""
+        start = 2 * (self.point.address - first)
+        return slice(start, start + 2 * self.point.words)
 
 
 class Decoder:
     """Decodes the blocks of one device with the readings chosen for it.
 
     `readings` maps point names to reading names; points not in it use the document's. MapError names every
-    entry that the map does not know. `implausible` counts the values withheld since the decoder was made.
+    entry that the map does not know. `implausible` counts the values withheld since the decoder was made;
+    `factors` are the points that tell the scaling of others.
     """
 
     def __init__(self, device_map: DeviceMap, readings: Mapping[str, str] | None = None) -> None:
         self.implausible = 0
         self._points = _bind(device_map, dict(readings or {}))
+        self.factors = frozenset(name for bound in self._points for name in bound.reading.factors)
         self._forms: dict[tuple[Space, int, int], _Form] = {}
 
-    def decode(self, space: Space, first: int, data: bytes, count: int | None = None) -> dict[str, Value]:
+    def decode(
+        self, space: Space, first: int, data: bytes, count: int | None = None, known: Mapping[str, Value] = _NOTHING
+    ) -> dict[str, Value]:
         """Values of the points that lie wholly in a block.
 
         `data` is big-endian words, or coils packed as in a reply (bit 0 first); `count` is the number of coils
-        asked for, without it all bits of `data` are taken. ValueError when registers come with half a word.
+        asked for, without it all bits of `data` are taken. `known` has values of `factors` that other blocks held.
+        ValueError when registers come with half a word.
         """
         if space is Space.COILS:
             count = min(8 * len(data), 8 * len(data) if count is None else count)
             data = b"".join((b"\x00\x01" if data[n >> 3] >> (n & 7) & 1 else b"\x00\x00") for n in range(count))
-        key = (space, first, len(data))
-        form = self._forms.get(key)
-        if form is None:
-            form = self._remember(key)
+        form = self._form(space, first, len(data))
         values: dict[str, Value] = {}
         for (name, low, high), half in zip(form.half_points, form.halves.unpack(data), strict=True):
             if low <= half <= high:
@@ -92,7 +109,38 @@ class Decoder:
                 values[name] = value
             else:
                 self.implausible += 1
+        if form.scaled_points:
+            self._scale(form, data, values, known)
         return values
+
+    def texts(self, space: Space, first: int, data: bytes) -> dict[str, str]:
+        """Texts of the points that lie wholly in a block of registers; there are none in coils."""
+        if space is Space.COILS:
+            return {}
+        found = (
+            (name, decode_text(reading.codec, data[place], reading.order))
+            for name, place, reading in self._form(space, first, len(data)).texts
+        )
+        return {name: text for name, text in found if text is not None}
+
+    def _scale(self, form: _Form, data: bytes, values: dict[str, Value], known: Mapping[str, Value]) -> None:
+        """Rule 5; the points that tell the scaling are in `values` by now if this block holds them."""
+        here = {name: value for name in self.factors if (value := values.get(name, known.get(name))) is not None}
+        for (name, convert, low, high, factors), raw in zip(form.scaled_points, form.scaled.unpack(data), strict=True):
+            unscaled = raw if convert is None else convert(raw)
+            factor = product_of(factors, here)
+            if unscaled is None or factor is None:
+                continue
+            value = unscaled * factor
+            if low <= value <= high:
+                values[name] = value
+            else:
+                self.implausible += 1
+
+    def _form(self, space: Space, first: int, size: int) -> _Form:
+        key = (space, first, size)
+        form = self._forms.get(key)
+        return self._remember(key) if form is None else form
 
     def _remember(self, key: tuple[Space, int, int]) -> _Form:
         if len(self._forms) >= _MAX_FORMS:
@@ -108,13 +156,18 @@ class Decoder:
             and first <= bound.point.address
             and bound.point.address + bound.point.words - 1 <= last
         ]
+        texts = [bound for bound in inside if bound.point.kind is Kind.TEXT]
         halves = [bound for bound in inside if bound.is_half]
-        others = [bound for bound in inside if not bound.is_half]
+        scaled = [bound for bound in inside if bound.reading.factors]
+        others = [bound for bound in inside if bound not in texts and bound not in halves and bound not in scaled]
         form = _Form(
             _format(halves, first, size, {1: "e"}),
             tuple((bound.point.name, *bound.bounds) for bound in halves),
             _format(others, first, size, {1: "H", 2: "I"}),
             tuple((bound.point.name, _converter(bound), *bound.bounds) for bound in others),
+            _format(scaled, first, size, {1: "H", 2: "I"}),
+            tuple((bound.point.name, _converter(bound), *bound.bounds, bound.reading.factors) for bound in scaled),
+            tuple((bound.point.name, bound.slice_from(first), bound.reading) for bound in texts),
         )
         self._forms[key] = form
         return form
@@ -156,7 +209,8 @@ def _converter(bound: _Bound) -> _Convert | None:
     bits = 16 * bound.point.words
     swap = bound.point.words == 2 and bound.reading.order is WordOrder.LO_HI
     scaled = scaler(bound.reading.scale)
-    if codec.plain:
+    absent = bound.reading.absent
+    if codec.plain and not absent:
         if swap:
             return lambda raw: _in_order(raw, scaled)
         return scaled
@@ -164,7 +218,7 @@ def _converter(bound: _Bound) -> _Convert | None:
     def convert(raw: int) -> Value | None:
         if swap:
             raw = _swapped(raw)
-        value = codec.decode(raw, bits)
+        value = None if raw in absent else codec.decode(raw, bits)
         return value if value is None or scaled is None else scaled(value)
 
     return convert

@@ -12,6 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
+TEXT_CODEC_NAMES = frozenset({"ascii", "ipv4", "mac", "version"})
+"""The codecs whose values are texts (devices/texts.py)."""
+
 Value = float | int
 """A decoded value: float for measured points, int for counters, enumerations and bit fields. No value is `None`."""
 
@@ -24,7 +27,7 @@ class Space(StrEnum):
 
 
 class WordOrder(StrEnum):
-    """Which word of a 32-bit pair has the lower address."""
+    """Which word of a 32-bit pair has the lower address; of a text, which byte of each word comes first."""
 
     HI_LO = "hi-lo"
     LO_HI = "lo-hi"
@@ -68,6 +71,7 @@ class Extent:
     writable: bool
     doc: str
     wears: bool = False  # memory that lasts only so many writes (EEPROM)
+    products: tuple[str, ...] = ()  # the product codes that have it; empty: all of the model
 
     @property
     def count(self) -> int:
@@ -80,10 +84,12 @@ class Reading:
     """One way to read the words of a point (the document's, or one seen in the field)."""
 
     name: str
-    codec: str  # a name in devices/codecs.py
+    codec: str  # a name in devices/codecs.py or devices/texts.py
     order: WordOrder
-    scale: float  # value = raw × scale
+    scale: float  # value = raw × scale × the values of the points in `factors`
     evidence: str
+    factors: tuple[str, ...] = ()  # points of the same device that tell its scaling
+    absent: frozenset[int] = frozenset()  # raw numbers that stand for "no value"
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +99,30 @@ class MibColumn:
     column: int
     scale: int  # SNMP integer = round(value × scale)
     units: str  # UNITS clause; "" for enumerations and bit fields
-    syntax: str  # "Integer32", "Unsigned32", "Enumeration" or "Bits"
+    syntax: str  # "Integer32", "Unsigned32", "Enumeration", "Bits" or "Text"
+    named: str | None = None  # what the object is called after, where models cannot share one: None: the point
+
+
+class Released(StrEnum):
+    """What must be written to end control over a device that has to be rewritten (`Point.rewrite_s`)."""
+
+    BY_ZERO = "zero"
+    BY_NEGATIVE = "negative"  # and a zero changes nothing
+
+    def held_by(self, word: int, *, held: bool) -> bool:
+        """Whether the device is controlled after `word` was written; `held` says whether it was before."""
+        if self is Released.BY_ZERO:
+            return word != 0
+        return 0 < word < 0x8000 or (word == 0 and held)
+
+
+class Kind(StrEnum):
+    """What the values of a point are."""
+
+    NUMBER = "number"
+    ENUMERATION = "enumeration"
+    BITS = "bits"
+    TEXT = "text"
 
 
 class Emc1Form(StrEnum):
@@ -150,13 +179,23 @@ class Point:
     plausible: tuple[float, float] | None = None  # a value outside is withheld and counted, never shown
     multiplied_by: str | None = None  # point that multiplies this one before the device uses it
     note: str = ""  # where document and field, or two places of the document, disagree
-    rewrite_s: float | None = None  # a value not zero must be written again at least this often, or the device faults
+    rewrite_s: float | None = None  # what takes control must be written again at least this often, or the device faults
+    released: Released = Released.BY_ZERO  # what ends that control
     restarts: bool = False  # a write restarts the device, which then does not answer: silence is success
     named_only: bool = False  # to be written only where its very name was allowed, never as one of a range
     wears: bool = False  # a write makes the device write its own EEPROM
     conditions: BitConditions | None = None  # what its bits are to core/conditions.py
     setpoint: bool = False  # what the device aims at or acts upon, not what it measures
     emc1: Emc1Object | None = None
+
+    @property
+    def kind(self) -> Kind:
+        """What its values are."""
+        if any(reading.codec in TEXT_CODEC_NAMES for reading in self.readings):
+            return Kind.TEXT
+        if self.bits is not None:
+            return Kind.BITS
+        return Kind.NUMBER if self.enumeration is None else Kind.ENUMERATION
 
     @property
     def polled(self) -> bool:
@@ -261,7 +300,12 @@ class IdentityRules:
     vendor: str
     serial_first: int | None
     serial_words: int
+    serial_order: WordOrder = WordOrder.HI_LO
     growing: tuple[Growing, ...] = ()
+
+    def names(self, product: str) -> bool:
+        """Whether a unit that calls itself `product` is of this model."""
+        return product in self.product_codes or product.startswith(self.product_prefixes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,6 +336,10 @@ class DeviceMap:
                 return False
             first = max(inside)
         return True
+
+    def on_product(self, extent: Extent, product: str) -> bool:
+        """Whether a unit that calls itself `product` has the extent; of one that says nothing known, yes."""
+        return not extent.products or product in extent.products or product not in self.identity.product_codes
 
     def writable_point(self, space: Space, address: int) -> Point | None:
         """The point that a single write to this address changes, or None."""

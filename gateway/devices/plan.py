@@ -3,7 +3,7 @@
 Rule 1: whole blocks. Reserved words between points are read along: a second request costs more wire time
         than ten words, and the devices answer them.
 Rule 2: a block begins and ends with a shown point, holds at most 125 registers or 2000 coils (application
-        protocol V1.1b3, clauses 6.1 and 6.3) and never tears a 32-bit pair.
+        protocol V1.1b3, clauses 6.1 and 6.3) and never tears a point of several words.
 Rule 3: where it can be had, no two register blocks of a device are equally long: a late reply to one can then
         never be taken for the reply to another.
 """
@@ -53,9 +53,11 @@ def poll_plan(device_map: DeviceMap) -> tuple[PlannedBlock, ...]:
 def split(block: PlannedBlock, device_map: DeviceMap) -> tuple[PlannedBlock, PlannedBlock] | None:
     """Cut a block that the device refused in two, of unequal length where possible.
 
-    A 32-bit pair stays whole. None when there is nothing to cut: one register or coil, or one pair.
+    A point stays whole. None when there is nothing to cut: one register or coil, or one point.
     """
-    torn = {point.address + 1 for point in device_map.points if point.space is block.space and point.words == 2}
+    torn = {
+        point.address + k for point in device_map.points if point.space is block.space for k in range(1, point.words)
+    }
     middle = block.count // 2 + (block.count > 2 and block.count % 2 == 0)
     cuts = [cut for cut in range(1, block.count) if block.first + cut not in torn]
     if not cuts:

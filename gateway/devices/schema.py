@@ -37,9 +37,11 @@ from gateway.devices.model import (
     Point,
     PollClass,
     Reading,
+    Released,
     Space,
     WordOrder,
 )
+from gateway.devices.texts import MAX_WORDS, TEXT_CODECS
 from gateway.errors import MapError
 
 DOCUMENT_READING = "document"
@@ -67,6 +69,7 @@ class _Extent(_Form):
     poll: Literal["live", "settings", "background"] = "background"
     writable: bool = False
     wears: bool = False
+    products: tuple[Text, ...] = Field(default=(), strict=False)
     doc: Text
 
     def build(self) -> Extent:
@@ -79,32 +82,47 @@ class _Extent(_Form):
             self.writable,
             self.doc,
             self.wears,
+            self.products,
         )
 
 
-class _Alternative(_Form):
-    name: Label
+class _Reading(_Form):
+    """How the words of a point are read: value = raw × scale / 2^shift × what `scaled_by` names."""
+
     codec: str
     order: OrderName | None = None
     scale: Number = 1
+    shift: Annotated[int, Field(ge=0, le=32)] = 0
+    scaled_by: tuple[Label, ...] = Field(default=(), strict=False)
+    absent: tuple[Annotated[int, Field(ge=0)], ...] = Field(default=(), strict=False)
+
+    def reading(self, name: str, evidence: str) -> Reading:
+        scale = float(self.scale) / 2**self.shift
+        order = WordOrder(self.order or "hi-lo")
+        return Reading(name, self.codec, order, scale, evidence, self.scaled_by, frozenset(self.absent))
+
+
+class _Alternative(_Reading):
+    name: Label
     evidence: Text
 
     def build(self) -> Reading:
-        return Reading(self.name, self.codec, WordOrder(self.order or "hi-lo"), float(self.scale), self.evidence)
+        return self.reading(self.name, self.evidence)
 
 
 class _Mib(_Form):
     column: Annotated[int, Field(ge=2)]  # 1 is the index
     scale: Annotated[int, Field(ge=1)] = 1
     units: str = ""
-    syntax: Literal["Integer32", "Unsigned32", "Enumeration", "Bits"]
+    syntax: Literal["Integer32", "Unsigned32", "Enumeration", "Bits", "Text"]
+    named: Label | None = None
 
     def build(self) -> MibColumn:
-        return MibColumn(self.column, self.scale, self.units, self.syntax)
+        return MibColumn(self.column, self.scale, self.units, self.syntax, self.named)
 
 
 class _Conditions(_Form):
-    first: Annotated[int, Field(ge=100, le=300)]
+    first: Annotated[int, Field(ge=100, le=900)]
     name: Label
 
     def build(self) -> BitConditions:
@@ -119,20 +137,17 @@ class _Emc1(_Form):
         return Emc1Object(self.number, Emc1Form(self.form))
 
 
-class _Point(_Form):
+class _Point(_Reading):
     name: Label
     space: SpaceName = "registers"
     address: Address
-    words: Annotated[int, Field(ge=1, le=2)] = 1
+    words: Annotated[int, Field(ge=1, le=MAX_WORDS)] = 1
     symbol: Text
     group: Literal["live", "energy", "today", "settings", "command"]
     unit: str = ""
     help: Text
     doc: Text
     access: Literal["read", "write", "set"] = "read"
-    codec: str
-    order: OrderName | None = None
-    scale: Number = 1
     evidence: Text = "the document"
     alternative: tuple[_Alternative, ...] = Field(default=(), strict=False)
     minimum: Number | None = None
@@ -144,6 +159,7 @@ class _Point(_Form):
     confidence: Literal["documented", "low"] = "documented"
     note: str = ""
     rewrite_s: Annotated[Number, Field(gt=0)] | None = None
+    released: Literal["zero", "negative"] = "zero"
     restarts: bool = False
     named_only: bool = False
     wears: bool = False
@@ -155,19 +171,18 @@ class _Point(_Form):
     metric_scale: Number = 1
 
     def order_problems(self) -> list[str]:
-        """A pair without a word order, or a single word with one."""
+        """A pair or a text without an order, or a single word with one."""
         found = []
-        for name, order in ((DOCUMENT_READING, self.order), *((a.name, a.order) for a in self.alternative)):
-            if self.words > 1 and order is None:
+        for name, entry in ((DOCUMENT_READING, self), *((entry.name, entry) for entry in self.alternative)):
+            ordered = self.words > 1 or entry.codec in TEXT_CODECS
+            if ordered and entry.order is None:
                 found.append(f"reading {name}: a {16 * self.words}-bit point needs order hi-lo or lo-hi")
-            if self.words == 1 and order is not None:
+            if not ordered and entry.order is not None:
                 found.append(f"reading {name}: a single word has no order")
         return found
 
     def build(self) -> Point:
-        first = Reading(
-            DOCUMENT_READING, self.codec, WordOrder(self.order or "hi-lo"), float(self.scale), self.evidence
-        )
+        first = self.reading(DOCUMENT_READING, self.evidence)
         return Point(
             name=self.name,
             space=Space(self.space),
@@ -192,6 +207,7 @@ class _Point(_Form):
             multiplied_by=self.multiplied_by,
             note=self.note,
             rewrite_s=None if self.rewrite_s is None else float(self.rewrite_s),
+            released=Released(self.released),
             restarts=self.restarts,
             named_only=self.named_only,
             wears=self.wears,
@@ -276,6 +292,7 @@ class _Identity(_Form):
     product_codes: tuple[Text, ...] = Field(strict=False)
     serial_first: Address | None = None
     serial_words: Annotated[int, Field(ge=0)] = 0
+    serial_order: OrderName = "hi-lo"
     growing: tuple[_Growing, ...] = Field(default=(), strict=False)
 
     def build(self) -> IdentityRules:
@@ -285,6 +302,7 @@ class _Identity(_Form):
             self.vendor,
             self.serial_first,
             self.serial_words,
+            WordOrder(self.serial_order),
             tuple(growing.build() for growing in self.growing),
         )
 

@@ -41,7 +41,7 @@ UNITS: Mapping[str, Unit] = MappingProxyType(
             _unit("W", "watts", 1, {1000: "milliwatts"}),
             _unit("°C", "celsius", 1, {1000: "0.001 degrees Celsius"}),
             _unit("Ah", "amperehours", 1, {10: "0.1 ampere-hours", 1000: "milliampere-hours"}),
-            _unit("kWh", "watthours", 1000, {10: "0.1 kilowatt-hours"}),
+            _unit("kWh", "watthours", 1000, {10: "0.1 kilowatt-hours", 1000: "watt-hours"}),
             _unit("h", "seconds", 3600, {1: "hours"}),
             _unit("s", "seconds", 1, {1: "seconds"}),
             _unit("d", "seconds", 86400, {1: "days"}),
@@ -60,3 +60,8 @@ def metric_name(point: str, unit: Unit, *, counter: bool) -> str:
     if unit.metric_suffix:
         name += "_" + unit.metric_suffix
     return name + "_total" if counter else name
+
+
+def info_name(point: str) -> str:
+    """The metric name of a point that is a text: a series of 1 whose label holds it."""
+    return f"{METRIC_PREFIX}{point}_info"

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
-from gateway.devices.model import DeviceMap, Group, Point
-from gateway.devices.schema import load_map, models
+from gateway.devices.agreement import all_maps
+from gateway.devices.model import DeviceMap, Group, Kind, Point
 from gateway.devices.units import UNITS
 from gateway.generate.panels import Panel, Query, Row, Variable, dashboard
+from gateway.generate.rules import battery_multiplier
 
 FOLDER = "deploy/grafana/dashboards"
 
@@ -45,7 +46,7 @@ _GOOD_IF_ANY: Sequence[tuple[float | None, str]] = ((None, "red"), (1, "green"))
 
 def dashboard_outputs() -> dict[str, str]:
     """The dashboards by path from the repository."""
-    maps = [load_map(model) for model in models()]
+    maps = all_maps()
     return {
         f"{FOLDER}/site.json": dashboard("prostar-site", "ProStar: site", [SITE], _site()),
         f"{FOLDER}/controller.json": dashboard(
@@ -74,8 +75,7 @@ def _site() -> list[Row]:
         ),
         _stat(
             "Lowest battery, as 12 V",
-            f"min(morningstar_battery_voltage_slow_60s_volts{_AT_SITE}"
-            f" / morningstar_settings_voltage_multiplier_ratio{_AT_SITE})",
+            f"min(morningstar_battery_voltage_slow_60s_volts{_AT_SITE} / ({battery_multiplier(_AT_SITE)}))",
             "volt",
             steps=((None, "red"), (11.6, "orange"), (11.9, "yellow"), (12.1, "green")),
         ),
@@ -194,15 +194,15 @@ def _controller(maps: Sequence[DeviceMap]) -> Iterator[Row]:
     totals = [point for point in _points(maps) if point.group is Group.ENERGY]
     today = [point for point in _points(maps) if point.group is Group.TODAY and point.bits is None]
     yield Row("Energy and time", [_table("Counters", totals), _table("Today", today)])
-    settings = [
-        point for point in _points(maps) if point.group is Group.SETTINGS and not (point.bits or point.enumeration)
-    ]
+    settings = [point for point in _points(maps) if point.group is Group.SETTINGS and point.kind is Kind.NUMBER]
+    texts = [point for point in _points(maps) if point.kind is Kind.TEXT]
     yield Row(
         "Settings",
         [
             _table(suffix.replace("_", " ") or "numbers", [point for point in settings if _suffix(point) == suffix])
             for suffix in dict.fromkeys(map(_suffix, settings))
-        ],
+        ]
+        + ([_text_table("Texts", texts)] if texts else []),
     )
     yield Row(
         "Gateway",
@@ -279,6 +279,11 @@ def _table(title: str, points: Sequence[Point]) -> Panel:
         unit=unit,
         height=10,
     )
+
+
+def _text_table(title: str, points: Sequence[Point]) -> Panel:
+    """One line a text; the point's name and its text are in the columns `point` and the one called after it."""
+    return Panel(title, [Query(_named(points), instant=True)], kind="table", height=10)
 
 
 def _line() -> list[Row]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
+from gateway.devices.agreement import all_maps
 from gateway.devices.model import DeviceMap, Point
-from gateway.devices.schema import load_map, models
 from gateway.devices.units import UNITS
 from gateway.faces.http.devices import DEVICE_LABELS, DEVICE_METRICS, point_metric
 from gateway.faces.http.metric import MetricInfo
@@ -29,7 +29,8 @@ _NAMES = """\
   is a gauge without `_total`.
 - An enumeration is one series a state with the label `state`, a bit field one series a bit with the label `bit`; each
   is 1 or 0. A number or bit that the document does not name shows itself as `value_<n>` or `bit_<n>`.
-- Voltage settings are those of a 12 V battery, as the controller keeps them;
+- A text is a series of 1 that ends in `_info`, with the text in a label that is called as the point is.
+- Voltage settings of a ProStar are those of a 12 V battery, as the controller keeps them;
   `morningstar_settings_voltage_multiplier_ratio` is what it multiplies them by."""
 
 _HEADINGS = ("Metric", "Type", "Labels", "What")
@@ -37,7 +38,7 @@ _HEADINGS = ("Metric", "Type", "Labels", "What")
 
 def metric_outputs() -> dict[str, str]:
     """The page by path from the repository."""
-    maps = [load_map(model) for model in models()]
+    maps = all_maps()
     return {"docs/metrics.md": metric_page(maps, OWN_METRICS)}
 
 
@@ -92,17 +93,17 @@ def _point_rows(maps: tuple[DeviceMap, ...]) -> Iterator[tuple[str, ...]]:
 
 
 def _label_values(maps: tuple[DeviceMap, ...]) -> Iterator[str]:
-    rows: dict[tuple[str, str], tuple[str, ...]] = {}
+    rows: dict[tuple[str, str], dict[str, None]] = {}  # a set that keeps the order
     for device_map in maps:
         for point in device_map.points:
             if point.metric is None:
                 continue
             if point.enumeration is not None:
-                names = tuple(value.name for value in device_map.enumerations[point.enumeration])
-                rows.setdefault((point.metric, "state"), names)
+                names = [value.name for value in device_map.enumerations[point.enumeration]]
+                rows.setdefault((point.metric, "state"), {}).update(dict.fromkeys(names))
             elif point.bits is not None:
-                names = tuple(bit.name for bit in device_map.bit_tables[point.bits])
-                rows.setdefault((point.metric, "bit"), names)
+                names = [bit.name for bit in device_map.bit_tables[point.bits]]
+                rows.setdefault((point.metric, "bit"), {}).update(dict.fromkeys(names))
     yield table(
         ("Metric", "Label", "Values"),
         ((code(metric), code(name), _codes(values)) for (metric, name), values in sorted(rows.items())),

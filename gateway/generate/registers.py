@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from gateway.devices.codecs import CODECS
-from gateway.devices.model import Access, DeviceMap, Extent, Group, Point, PollClass, Reading, Space, WordOrder
+from gateway.devices.model import Access, DeviceMap, Extent, Group, Kind, Point, PollClass, Reading, Space, WordOrder
 from gateway.devices.plan import poll_plan
 from gateway.devices.schema import load_map, models
-from gateway.faces.snmp.layout import object_name
+from gateway.devices.texts import TEXT_CODECS
+from gateway.faces.snmp.layout import column_name
 from gateway.generate.markdown import bullets, code, generated_mark, page, table
 
 _POINT_HEADINGS = (
@@ -72,7 +73,7 @@ def _blocks(device_map: DeviceMap) -> Iterator[str]:
         ),
     )
     for extent in device_map.extents:
-        if extent.poll is not PollClass.BACKGROUND:
+        if any(_lies_in(point, extent) for point in device_map.points):
             yield f"## {_title(extent)}"
             yield _points(device_map, extent)
     yield from _log(device_map)
@@ -99,7 +100,11 @@ def _functions(device_map: DeviceMap) -> str:
     )
     if identity.serial_first is not None:
         last = identity.serial_first + identity.serial_words - 1
-        items.append(f"serial number: text at {_range(identity.serial_first, last)}, undocumented, asked for once")
+        documented = any(point.address == identity.serial_first for point in device_map.points)
+        items.append(
+            f"serial number: text at {_range(identity.serial_first, last)}"
+            f"{'' if documented else ', undocumented'}, asked for once"
+        )
     return bullets(items)
 
 
@@ -151,20 +156,35 @@ def _point_row(point: Point, extent: Extent) -> tuple[str, ...]:
         _codec(point, point.readings[0]),
         _ACCESS[point.access] + (", by name only" if point.named_only else ""),
         "never" if point.group is Group.COMMAND else extent.poll.value,
-        code(object_name(point.name)) if point.mib is not None else "",
+        code(column_name(point)) if point.mib is not None else "",
         code(point.metric or ""),
         text,
     )
 
 
 def _codec(point: Point, reading: Reading) -> str:
+    if point.kind is Kind.TEXT:
+        swapped = ", low byte first" if reading.order is WordOrder.LO_HI else ""
+        return TEXT_CODECS[reading.codec].text + swapped
     text = CODECS[reading.codec].text
     if point.words > 1:
         text += f", {_ORDER[reading.order]}"
     if reading.scale != 1:
-        text += f", × {reading.scale:g}"
+        text += f", × {_scale(reading.scale)}"
+    text += "".join(f" × `{factor}`" for factor in reading.factors)
+    if reading.absent:
+        text += f", no value: {', '.join(code(f'0x{raw:04X}') for raw in sorted(reading.absent))}"
     table_name = point.enumeration or point.bits
     return f"{text}, [{table_name}](#{table_name})" if table_name else text
+
+
+def _scale(scale: float) -> str:
+    """A scale as the document writes it: `6.6 / 2^15`, else the plain number."""
+    for shift in (15, 16, 17):
+        whole = round(scale * 2**shift, 9)
+        if whole >= 1 and whole * 1000 == round(whole * 1000, 6) and scale < 0.001:
+            return f"{whole:g} / 2^{shift}"
+    return f"{scale:g}"
 
 
 def _noted(point: Point) -> bool:

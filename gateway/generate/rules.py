@@ -4,7 +4,9 @@ Rule 1: names of metrics, states and bits come from the maps and from the HTTP f
         alarms from the maps, so that a rule cannot wait for a series that nobody makes.
 Rule 2: an alert stays while its cause does. What moves around a limit has two limits, further apart than the
         smallest step of a half-precision float.
-Rule 3: battery limits are for a 12 V lead-acid battery; the controller's own multiplier makes them fit 24 V.
+Rule 3: battery limits are for a 12 V lead-acid battery. What makes them fit 24 and 48 V is the controller's own
+        multiplier where it tells one, else the highest voltage that it has seen on its battery.
+Rule 4: models that call a bit the same share its alert.
 """
 
 from __future__ import annotations
@@ -13,8 +15,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN
-from gateway.devices.model import DeviceMap, Group, Point
-from gateway.devices.schema import load_map, models
+from gateway.devices.agreement import all_maps
+from gateway.devices.model import Bit, DeviceMap, Group, Point
 from gateway.generate.yaml import Node, dump
 
 FOLDER = "deploy/prometheus/rules"
@@ -30,11 +32,15 @@ FIELD_ERROR_RATIO = 1.5e-4
 LEAST_ERRORS = 10
 """So few failures in six hours are no rate."""
 
+HIGHEST_VOLTS = {12: 20, 24: 40}
+"""Nominal voltage → what its battery never reaches, and that of the next higher system does. 36 V counts as 48 V."""
+
 DAYLIGHT_VOLTS = 2.0
 """By day the array is that much above the battery of a 12 V system, also when nothing flows."""
 
 _WAIT = {"critical": "0s", "warning": "1m", "info": "5m"}
 _PER_12V = "device:morningstar_battery_voltage_volts:per_12v"
+_MULTIPLIER = "device:morningstar_battery_multiplier:ratio"
 _ERRORS = "line:prostar_gateway_device_errors:increase6h"
 _ERROR_RATIO = "line:prostar_gateway_device_errors:ratio6h"
 _LINE = "job, instance, site, line"
@@ -77,9 +83,19 @@ class Alert:
         }
 
 
+def battery_multiplier(matchers: str = "") -> str:
+    """PromQL: how many times 12 V the battery of each controller has; `matchers` choose controllers."""
+    told = f"morningstar_settings_voltage_multiplier_ratio{matchers}"
+    highest = f"morningstar_battery_voltage_maximum_volts{matchers}"
+    return (
+        f"{told} or on ({_DEVICE}) "
+        f"(1 + ({highest} >= bool {HIGHEST_VOLTS[12]}) + 2 * ({highest} >= bool {HIGHEST_VOLTS[24]}))"
+    )
+
+
 def rule_outputs() -> dict[str, str]:
     """The rule files by path from the repository."""
-    maps = [load_map(model) for model in models()]
+    maps = all_maps()
     files: dict[str, dict[str, Sequence[Recording | Alert]]] = {
         "recording.yml": {"prostar-gateway-recording": RECORDINGS},
         "alerts.yml": {
@@ -102,10 +118,8 @@ def rule_outputs() -> dict[str, str]:
 
 
 RECORDINGS: tuple[Recording, ...] = (
-    Recording(
-        _PER_12V,
-        "morningstar_battery_voltage_slow_60s_volts / morningstar_settings_voltage_multiplier_ratio",
-    ),
+    Recording(_MULTIPLIER, battery_multiplier()),
+    Recording(_PER_12V, f"morningstar_battery_voltage_slow_60s_volts / ({battery_multiplier()})"),
     Recording("site:morningstar_up:sum", "sum by (job, instance, site) (morningstar_up)"),
     Recording("site:morningstar_up:count", "count by (job, instance, site) (morningstar_up)"),
     Recording(
@@ -256,14 +270,14 @@ or
             wait,
             severity,
             f"The battery of {_AT} has {{{{ $value | printf `%.2f` }}}} V for each 12 V",
-            f"Mean of a minute below {low} V ({2 * low:g} V in a 24 V system); it ends above {clear} V "
-            f"({2 * clear:g} V). The limits suit lead-acid batteries.",
+            f"Mean of a minute below {low} V ({2 * low:g} V in a 24 V system, {4 * low:g} V in one of 48 V); it ends "
+            f"above {clear} V ({2 * clear:g} V, {4 * clear:g} V). The limits suit lead-acid batteries.",
         )
     yield Alert(
         "MorningstarNoChargeByDay",
         f"""\
     morningstar_array_voltage_volts
-  > morningstar_battery_voltage_volts + {DAYLIGHT_VOLTS:g} * morningstar_settings_voltage_multiplier_ratio
+  > morningstar_battery_voltage_volts + {DAYLIGHT_VOLTS:g} * {_MULTIPLIER}
 and
     morningstar_charge_current_amperes < 0.1
 unless
@@ -296,31 +310,25 @@ and
     )
 
 
-def bit_alerts(maps: list[DeviceMap]) -> Iterator[Alert]:
-    """One for each bit of the faults and alarms of now, and one for bits without a name."""
-    known: dict[str, Alert] = {}
+def bit_alerts(maps: Sequence[DeviceMap]) -> Iterator[Alert]:
+    """One for each name of a bit of the faults and alarms of now, and one for bits without a name."""
+    named: dict[str, tuple[Point, Bit, list[str]]] = {}
+    unnamed: dict[str, Point] = {}
     for device_map in maps:
         for point in filter(_alerts, device_map.points):
+            unnamed.setdefault(_camel(f"morningstar_{_one_of(point)}_unnamed"), point)
             for bit in device_map.bit_tables[point.bits or ""]:
-                alert = Alert(
-                    _camel(f"morningstar_{_one_of(point)}_{bit.name}"),
-                    f'{point.metric}{{bit="{bit.name}"}} == 1',
-                    _WAIT[bit.severity],
-                    bit.severity,
-                    f"{_AT}: {bit.text}",
-                    f"Bit {bit.number} of {point.symbol}: {point.help}",
-                )
-                known.setdefault(alert.name, alert)
-            unnamed = Alert(
-                _camel(f"morningstar_{_one_of(point)}_unnamed"),
-                f'{point.metric}{{bit=~"bit_[0-9]+"}} == 1',
-                _WAIT["warning"],
-                "warning",
-                f"{_AT}: {{{{ $labels.bit }}}} of {point.symbol} is set, which no document names",
-                point.help,
-            )
-            known.setdefault(unnamed.name, unnamed)
-    yield from known.values()
+                name = _camel(f"morningstar_{_one_of(point)}_{bit.name}")
+                _, _, places = named.setdefault(name, (point, bit, []))
+                places.append(f"Bit {bit.number} of {point.symbol} of a {device_map.title}.")
+    for name, (point, bit, places) in named.items():
+        expr = f'{point.metric}{{bit="{bit.name}"}} == 1'
+        yield Alert(name, expr, _WAIT[bit.severity], bit.severity, f"{_AT}: {bit.text}", " ".join(places))
+    for name, point in unnamed.items():
+        expr = f'{point.metric}{{bit=~"bit_[0-9]+"}} == 1'
+        what = point.name.replace("_", " ")
+        summary = f"{_AT}: {{{{ $labels.bit }}}} of the {what} is set, which no document names"
+        yield Alert(name, expr, _WAIT["warning"], "warning", summary, point.help)
 
 
 def _alerts(point: Point) -> bool:

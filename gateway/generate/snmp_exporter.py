@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from gateway.devices.model import DeviceMap, Point
 from gateway.devices.schema import load_map, models
 from gateway.devices.units import METRIC_PREFIX
-from gateway.faces.snmp.layout import Layout, shipped_layout
+from gateway.faces.snmp.layout import Layout, column_name, shipped_layout
 from gateway.faces.snmp.objects import ObjectType, RowKind, ScalarGroup, Syntax, Table
 from gateway.faces.snmp.settings import DEFAULT_ROOT, Oid
 from gateway.generate.yaml import Node, dump
@@ -69,7 +69,7 @@ def metric_of(point: Point) -> tuple[str, int | None]:
     """
     assert point.mib is not None
     assert point.metric is not None
-    if point.mib.syntax in {"Enumeration", "Bits"}:
+    if point.mib.syntax in {"Enumeration", "Bits", "Text"}:
         return point.metric, None
     factor = point.metric_scale / point.mib.scale
     power = round(math.log10(factor))
@@ -119,16 +119,17 @@ class _Names:
 
     def __init__(self, described: Layout, maps: Sequence[DeviceMap]) -> None:
         self._points: dict[str, Point] = {}
-        self._labels: dict[str, dict[int, str]] = {}
+        self._labels: dict[str, dict[int, str]] = {}  # by the name of the column
         for device_map in maps:
             for point in device_map.points:
                 self._points.setdefault(point.name, point)
+                if point.mib is None:
+                    continue
+                labels = self._labels.setdefault(column_name(point), {})
                 if point.enumeration is not None:
-                    values = device_map.enumerations[point.enumeration]
-                    self._labels.setdefault(point.name, {}).update((each.number, each.name) for each in values)
+                    labels.update((each.number, each.name) for each in device_map.enumerations[point.enumeration])
                 if point.bits is not None:
-                    bits = device_map.bit_tables[point.bits]
-                    self._labels.setdefault(point.name, {}).update((each.number, each.name) for each in bits)
+                    labels.update((each.number, each.name) for each in device_map.bit_tables[point.bits])
         self._oids = {
             column.name: _dotted((*table.base, 1, column.number))
             for table in described.tables
@@ -202,7 +203,9 @@ class _Names:
         node: dict[str, Node] = {"name": name, "oid": oid, "type": "gauge", "help": point.help, **labels}
         if each.syntax is Syntax.ENUMERATION or each.syntax is Syntax.BITS:
             node["type"] = "EnumAsStateSet" if each.syntax is Syntax.ENUMERATION else "Bits"
-            node["enum_values"] = {str(number): text for number, text in sorted(self._labels[point.name].items())}
+            node["enum_values"] = {str(number): text for number, text in sorted(self._labels[each.name].items())}
+        elif each.syntax is Syntax.TEXT:
+            node["type"] = "DisplayString"
         elif power is not None:
             # The exporter puts the name of an extract behind that of the metric.
             begin, _, end = name.rpartition("_")

@@ -9,16 +9,16 @@ Rule 4: uuids follow from names, so a template that is imported again changes wh
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 from gateway.core.conditions import ConditionState, Severity
 from gateway.devices.model import DeviceMap, Group, Point
 from gateway.devices.schema import load_map, models
-from gateway.faces.snmp.layout import Layout, shipped_layout
+from gateway.faces.snmp.layout import Layout, column_name, shipped_layout
 from gateway.faces.snmp.objects import Convention, ObjectType, Syntax, Table
 from gateway.faces.snmp.settings import DEFAULT_ROOT, Oid
 from gateway.faces.snmp.standard import SYSTEM
-from gateway.generate.rules import BATTERY_LIMITS
+from gateway.generate.rules import BATTERY_LIMITS, HIGHEST_VOLTS
 from gateway.generate.yaml import Node, dump
 from gateway.generate.zabbix_parts import (
     IF_THERE,
@@ -45,6 +45,7 @@ UNITS = {"V": "V", "A": "A", "W": "W", "°C": "°C", "Ah": "Ah", "kWh": "Wh", "h
 _DELAYS = {Group.LIVE: "1m", Group.ENERGY: "5m", Group.TODAY: "5m", Group.SETTINGS: "1h"}
 _BATTERY = "battery_voltage_slow_60s"
 _MULTIPLIER = "settings_voltage_multiplier"
+_HIGHEST = "battery_voltage_maximum"
 _ALSO = frozenset({_MULTIPLIER, "software_version"})
 """Settings that are of use here; the others hardly change."""
 
@@ -203,13 +204,13 @@ class _Template:
         table = self._tables["pgwDevice"]
         macros = {"{#NAME}": (table, "pgwDeviceName"), "{#MODEL}": (table, "pgwDeviceModel")}
         columns = {
-            column.point: (holder, column)
+            column.name: (holder, column)
             for holder in self._tables.values()
             for column in holder.columns
             if column.point
         }
         prototypes = [
-            self._point(device_map, point, *columns[point.name])
+            self._point(device_map, point, *columns[column_name(point)])
             for point in device_map.points
             if point.mib is not None
             and ((point.group in _DELAYS and point.group is not Group.SETTINGS) or point.name in _ALSO)
@@ -220,22 +221,22 @@ class _Template:
             "item_prototypes": prototypes,
         }
         names = {point.name for point in device_map.points}
-        if {_BATTERY, _MULTIPLIER} <= names:
-            node["trigger_prototypes"] = list(self._battery(device_map.model))
+        if _BATTERY in names and (factor := _times_12_v(device_map.model, names)):
+            node["trigger_prototypes"] = list(self._battery(device_map.model, factor))
         return node
 
-    def _battery(self, model: str) -> Iterator[Node]:
-        voltage, factor = (f"/{TEMPLATE}/{_key(model, name)}" for name in (_BATTERY, _MULTIPLIER))
+    def _battery(self, model: str, factor: str) -> Iterator[Node]:
+        voltage = f"/{TEMPLATE}/{_key(model, _BATTERY)}"
         for name, (_, _, severity, _) in BATTERY_LIMITS.items():
             words = {"Low": "low", "VeryLow": "very low"}[name]
             yield {
                 **trigger(
                     f"{{#NAME}}: battery {words}",
-                    f"max({voltage},5m)<{{$BATTERY.{name.upper()}.BELOW}}*last({factor})",
+                    f"max({voltage},5m)<{{$BATTERY.{name.upper()}.BELOW}}*{factor}",
                     _BATTERY_PRIORITIES[severity],
                 ),
                 "recovery_mode": "RECOVERY_EXPRESSION",
-                "recovery_expression": f"min({voltage},5m)>{{$BATTERY.{name.upper()}.ENDS}}*last({factor})",
+                "recovery_expression": f"min({voltage},5m)>{{$BATTERY.{name.upper()}.ENDS}}*{factor}",
             }
 
     def _point(self, device_map: DeviceMap, point: Point, table: Table, column: ObjectType) -> Node:
@@ -291,6 +292,16 @@ class _Template:
         assert convention is not None
         self._used[convention.name] = convention
         return {"valuemap": {"name": convention.name}}
+
+
+def _times_12_v(model: str, names: Collection[str]) -> str:
+    """How many times 12 V the battery of a controller has, as an expression; "" where nothing tells."""
+    if _MULTIPLIER in names:
+        return f"last(/{TEMPLATE}/{_key(model, _MULTIPLIER)})"
+    if _HIGHEST in names:
+        highest = f"last(/{TEMPLATE}/{_key(model, _HIGHEST)})"
+        return f"(1+({highest}>={HIGHEST_VOLTS[12]})+2*({highest}>={HIGHEST_VOLTS[24]}))"
+    return ""
 
 
 def _key(model: str, point: str) -> str:

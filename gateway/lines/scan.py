@@ -17,8 +17,9 @@ from dataclasses import dataclass, replace
 
 import serial
 
+from gateway.devices.agreement import map_of_product
 from gateway.devices.model import DeviceMap, Identification, Space
-from gateway.devices.schema import load_map, models
+from gateway.devices.texts import decode_text
 from gateway.errors import PortError, ReplyCrcError, ReplyMismatch, RequestError
 from gateway.modbus.counters import RtuCounters
 from gateway.modbus.pdu import Function, ReadRequest, is_exception, parse_identification, read_identification_request
@@ -114,7 +115,7 @@ class Scanner:
             return found
         texts = (objects.get(number, b"").decode("ascii", "replace").strip("\0 ") for number in range(3))
         identification = Identification(*texts)
-        device_map = _map_of(identification)
+        device_map = map_of_product(identification.product)
         if device_map is None:
             return replace(found, identification=identification)
         return replace(
@@ -133,8 +134,8 @@ class Scanner:
         answer = self._insist(address, request, timeout_s)
         if answer is None:
             return None
-        text = answer[2:].strip(b"\0\xff ").decode("ascii", "replace")
-        return text if text.isascii() and text.isprintable() and " " not in text and text else None
+        text = decode_text("ascii", answer[2:], rules.serial_order)
+        return None if text is None or " " in text else text
 
     def _insist(self, address: int, pdu: bytes, timeout_s: float) -> bytes | None:
         """The reply to one of a few tries, or None; an exception is no reply here."""
@@ -183,11 +184,3 @@ class Scanner:
         except (OSError, TypeError, AttributeError, serial.SerialException) as error:
             raise PortError(str(error)) from error
         return heard or bool(data), self._rtu.receive(bytes(data), time.monotonic())
-
-
-def _map_of(identification: Identification) -> DeviceMap | None:
-    for model in models():
-        rules = load_map(model).identity
-        if identification.product in rules.product_codes or identification.product.startswith(rules.product_prefixes):
-            return load_map(model)
-    return None

@@ -7,7 +7,7 @@ Rules, with the document's own words for the set points:
 2. Float ends when the battery was below it for Et_float_exit_cum seconds in total.
 3. Equalize takes the place of absorption when Et_eqcalendar days passed or a client triggered it, and ends
    after Et_eq_reg seconds at EV_eq or Et_eq_above seconds above EV_reg.
-4. Slave voltage overrides the stages; a fixed array voltage replaces bulk by FIXED.
+4. Slave voltage or current overrides the stages; a fixed array voltage replaces bulk by FIXED.
 5. A fault or a disconnect order stops charging at once. Night begins after five minutes without usable array voltage.
 6. Voltage set points are for 12 V and multiplied; charge set points move with the battery's temperature from 25 °C.
 7. The load goes off below LVD (lowered by its own current) after the warning time and comes back at LVR.
@@ -110,8 +110,14 @@ class Orders:
     load_disconnect: bool = False
     equalize: bool = False
     slave_v: float = 0.0
+    slave_a: float = 0.0
     fixed_array_v: float = 0.0
     fixed_array_fraction: float = 0.0
+
+    @property
+    def slaved(self) -> bool:
+        """Whether a voltage or a current was given over Modbus."""
+        return self.slave_v > 0 or self.slave_a > 0
 
     @property
     def fixes_array(self) -> bool:
@@ -178,7 +184,7 @@ class Charger:
             return ChargeStage.FAULT
         if orders.charge_disconnect:
             return ChargeStage.DISCONNECT
-        if orders.slave_v > 0 and seen.usable:
+        if orders.slaved and seen.usable:
             return ChargeStage.SLAVE
         return None
 
@@ -248,7 +254,7 @@ class Charger:
     def _target(self, battery_c: float, points: SetPoints, orders: Orders) -> float:
         if self.stage not in CHARGING:
             return 0.0
-        if self.stage is ChargeStage.SLAVE:
+        if self.stage is ChargeStage.SLAVE and orders.slave_v > 0:
             wanted = orders.slave_v
         else:
             at_25 = {ChargeStage.FLOAT: points.float_v, ChargeStage.EQUALIZE: points.equalize_v}

@@ -1,14 +1,15 @@
 """What a write does to a controller.
 
-Rules (ProStar MPPT v05, "Write Single Register", coil table and definitions):
+Rules (ProStar MPPT v05 and TriStar MPPT v11, "Write Single Register", coil tables and definitions; a unit does what its
+map has points for):
 
 1. An EEPROM write is not verified. It raises "EEPROM setting edit" in both fault fields until a reset, or, from
    firmware 13 with setting_change_signal 1, the alarm "setting changed" instead.
 2. Set-only coils act when written with 1 and always read 0; clear_faults and clear_alarms leave what needs a reset.
 3. reset_control and factory_reset reboot the unit without an answer; RAM then begins with what EEPROM holds.
    factory_reset also puts every setting back, the Modbus address included.
-4. battery_target_voltage_slave must be written at least every 60 s while it is not 0, else the unit faults;
-   writing it again ends the fault.
+4. Slave control (voltage; a TriStar has a current too) must be written again within the time in the map, else the unit
+   faults; writing again ends the fault. What ends the control is in the map.
 5. Fixed array voltage and fraction work from RAM at once.
 6. What has no point, or a point that is only for reading, is refused (exception 02). The lighting test is confirmed
    and does nothing: no simulated unit is in lighting mode.
@@ -25,7 +26,8 @@ from gateway.simulator.factory import restore_factory_settings, set_points
 from gateway.simulator.memory import Memory
 from gateway.simulator.panel import Labels, store_totals
 
-SLAVE_TIMEOUT_S = 60.0
+_CONTROLS = {"battery_target_voltage_slave": "slave_v", "charge_current_limit_slave": "slave_a"}
+"""Point → the order that it gives."""
 
 _SIGNAL_BY_ALARM = 1
 _FIRST_FIRMWARE_WITH_ALARM = 13
@@ -37,10 +39,10 @@ def accepts_writes(point: Point) -> bool:
 
 
 class Commands:
-    """The write rules of one unit; `slave_deadline` is when slave control ends for lack of a refresh."""
+    """The write rules of one unit."""
 
     def __init__(self, memory: Memory, day: SolarDay, labels: Labels, firmware: int) -> None:
-        self.slave_deadline = math.inf
+        self._deadlines: dict[str, float] = {}  # point that controls the unit → when it must have been written again
         self._memory = memory
         self._day = day
         self._labels = labels
@@ -59,11 +61,17 @@ class Commands:
             "clear_alarms": self._clear_alarms,
             "force_eeprom_update": self._force_eeprom_update,
             "clear_battery_voltage_extremes": self._clear_extremes,
+            "reset_battery_service": self._reset_service,
         }
         self._reboots: Mapping[str, Callable[[], None]] = {
             "factory_reset": self._restore_settings,
             "reset_control": lambda: None,
         }
+
+    @property
+    def slave_deadline(self) -> float:
+        """When slave control ends for lack of a refresh."""
+        return min(self._deadlines.values(), default=math.inf)
 
     def write_coil(self, point: Point, value: int) -> bool:
         """Execute a write of 0 or 1; False when the unit reboots and does not answer."""
@@ -85,10 +93,8 @@ class Commands:
             self._day.points = set_points(self._memory, self._day.plant)
             return
         orders = self._day.orders
-        if point.name == "battery_target_voltage_slave":
-            orders.array_faults &= ~self._labels.mask("array_faults", "slave_timeout")
-            orders.slave_v = self._positive(point.name)
-            self.slave_deadline = now + SLAVE_TIMEOUT_S if orders.slave_v > 0 else math.inf
+        if point.rewrite_s is not None:
+            self._control(point, point.rewrite_s, value, now)
         orders.fixed_array_v = self._positive("array_fixed_voltage")
         orders.fixed_array_fraction = self._positive("array_fixed_fraction")
 
@@ -100,7 +106,8 @@ class Commands:
     def boot(self) -> None:
         """Start up: RAM begins with what EEPROM holds."""
         memory, orders = self._memory, self._day.orders
-        memory.set("battery_target_voltage_slave", 0.0)
+        for name in _CONTROLS:
+            memory.set(name, 0.0)
         orders.fixed_array_v = self._positive("stored_array_fixed_voltage")
         orders.fixed_array_fraction = self._positive("stored_array_fixed_fraction")
         memory.set("array_fixed_voltage", orders.fixed_array_v)
@@ -133,9 +140,22 @@ class Commands:
         value = self._memory.get(name)
         return float(value) if value is not None and value > 0 else 0.0
 
+    def _control(self, point: Point, rewrite_s: float, word: int, now: float) -> None:
+        """Rule 4."""
+        orders = self._day.orders
+        orders.array_faults &= ~self._labels.mask("array_faults", "slave_timeout")
+        order = _CONTROLS[point.name]
+        if not point.released.held_by(word, held=point.name in self._deadlines):
+            self._deadlines.pop(point.name, None)
+            setattr(orders, order, 0.0)
+            return
+        self._deadlines[point.name] = now + rewrite_s
+        if word:
+            setattr(orders, order, self._positive(point.name))
+
     def _end_slave_control(self) -> None:
-        self._day.orders.slave_v = 0.0
-        self.slave_deadline = math.inf
+        self._day.orders.slave_v = self._day.orders.slave_a = 0.0
+        self._deadlines.clear()
 
     def _restore_settings(self) -> None:
         restore_factory_settings(self._memory, self._day.plant)
@@ -150,7 +170,9 @@ class Commands:
         self._day.orders.charge_disconnect = value == 1
 
     def _clear_charge_resettable(self) -> None:
-        self._day.totals.charge_ah_r = self._day.totals.load_ah_r = 0.0
+        totals = self._day.totals
+        totals.charge_ah_r = totals.load_ah_r = 0.0
+        totals.battery_min_v = totals.battery_max_v = self._day.now.battery_v
 
     def _clear_charge_total(self) -> None:
         self._day.totals.charge_ah = self._day.totals.load_ah = 0.0
@@ -175,5 +197,9 @@ class Commands:
     def _clear_extremes(self) -> None:
         today, volts = self._day.today, self._day.now.battery_v
         today.battery_min_v = today.battery_max_v = volts
+        self._day.totals.battery_min_v = self._day.totals.battery_max_v = volts
         for name in ("battery_voltage_minimum_stored", "battery_voltage_maximum_stored"):
             self._memory.set(name, volts)
+
+    def _reset_service(self) -> None:
+        self._day.totals.service_at_h = self._day.hours

@@ -82,6 +82,7 @@ def past_totals(plant: Plant) -> Totals:
         charge_kwh=energy,
         charge_kwh_r=energy * 0.28,
         hours_before=24.0 * plant.age_days,
+        service_at_h=24.0 * (plant.age_days - plant.age_days % 180),
     )
 
 

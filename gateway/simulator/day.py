@@ -39,6 +39,10 @@ class Today:
     array_faults: int = 0
     load_faults: int = 0
     alarms: int = 0
+    charge_kwh: float = 0.0
+    output_max_w: float = 0.0
+    battery_min_c: float = 99.0
+    battery_max_c: float = -99.0
 
 
 @dataclass(slots=True)
@@ -52,6 +56,9 @@ class Totals:
     charge_kwh: float = 0.0
     charge_kwh_r: float = 0.0
     hours_before: float = 0.0  # hourmeter at the midnight the unit's time begins with
+    service_at_h: float = 0.0  # hourmeter when somebody last looked after the battery
+    battery_min_v: float = 99.0  # since the resettable charge was cleared
+    battery_max_v: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +95,7 @@ class Electrics:
     net_a: float = 0.0
     net_60s_a: float = 0.0
     charge_a: float = 0.0
+    charge_60s_a: float = 0.0
     load_a: float = 0.0
     array_v: float = 0.0
     array_a: float = 0.0
@@ -216,6 +224,8 @@ class SolarDay:
         points = self.points
         available = available_w * _EFFICIENCY / self.now.battery_v
         limit = min(self.plant.rated_a, points.charge_limit_a, points.battery_limit_a)
+        if self.charger.stage is ChargeStage.SLAVE and self.orders.slave_a > 0:
+            limit = min(limit, self.orders.slave_a)
         if self.conditions.heatsink_hot:
             limit *= _HOT_LIMIT
         self.conditions.current_limit = available > limit
@@ -230,6 +240,7 @@ class SolarDay:
         part = min(1.0, seconds / 60)
         now.battery_60s_v += (now.battery_v - now.battery_60s_v) * part
         now.net_60s_a += (now.net_a - now.net_60s_a) * part
+        now.charge_60s_a += (now.charge_a - now.charge_60s_a) * part
 
     def _warm(self, seconds: float) -> None:
         now = self.now
@@ -291,6 +302,12 @@ class SolarDay:
         energy = now.output_w * hours / 1000
         totals.charge_kwh += energy
         totals.charge_kwh_r += energy
+        today.charge_kwh += energy
+        today.output_max_w = max(today.output_max_w, now.output_w)
+        today.battery_min_c = min(today.battery_min_c, self.battery_c)
+        today.battery_max_c = max(today.battery_max_c, self.battery_c)
+        totals.battery_min_v = min(totals.battery_min_v, now.battery_v)
+        totals.battery_max_v = max(totals.battery_max_v, now.battery_v)
         today.battery_min_v = min(today.battery_min_v, now.battery_v)
         today.battery_max_v = max(today.battery_max_v, now.battery_v)
         today.array_max_v = max(today.array_max_v, now.array_v)

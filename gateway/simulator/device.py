@@ -11,13 +11,14 @@ import random
 from collections.abc import Mapping
 
 from gateway.devices.model import DeviceMap, Extent, PollClass, Space, WordOrder
+from gateway.devices.texts import encode_text
 from gateway.simulator.commands import Commands, accepts_writes
 from gateway.simulator.daily_log import DailyLog, fields_of, past_totals
 from gateway.simulator.day import SolarDay
 from gateway.simulator.factory import FACTORY_ADDRESS, restore_factory_settings, set_points
 from gateway.simulator.memory import Memory
 from gateway.simulator.panel import Labels, publish, store_totals
-from gateway.simulator.plant import PLANTS, Plant
+from gateway.simulator.plant import Plant, plants_of
 from gateway.simulator.server import Controller, missing
 from gateway.simulator.sky import DAY_S
 
@@ -27,9 +28,10 @@ _MAX_ADDRESS = 247
 
 
 class SimulatedController(Controller):
-    """One unit on a line; `plant` is what it is bolted to, by default one of `PLANTS` chosen by the seed.
+    """One unit on a line; `plant` is what it is bolted to, by default one of its model's chosen by the seed.
 
-    `serial_number` adds the undocumented ASCII registers; `log_order` is the word order of the daily log.
+    `serial_number` is one of its own by default; where the model's document knows none, it adds the undocumented
+    registers. `log_order` is the word order of the daily log.
     """
 
     def __init__(
@@ -49,22 +51,21 @@ class SimulatedController(Controller):
         log_order: WordOrder = WordOrder.HI_LO,
     ) -> None:
         super().__init__(device_map, address, turnaround_s)
-        self.plant = plant or PLANTS[seed % len(PLANTS)]
+        plants = plants_of(device_map)
+        self.plant = plant or plants[seed % len(plants)]
         self._seed = seed
         self._speed = speed
         self._reboot_s = reboot_s
         self._firmware = firmware
         self._labels = Labels(device_map)
-        self._memory = Memory(device_map, _serial_extent(device_map, serial_number))
-        if serial_number is not None and device_map.identity.serial_first is not None:
-            self._memory.store(
-                Space.REGISTERS, device_map.identity.serial_first, *_ascii_words(device_map, serial_number)
-            )
+        self._memory = Memory(device_map, _serial_extent(device_map, serial_number), self.plant.product)
+        self._set_scaling()
         self._born: float | None = None
         self._outdated = True
         self._deaf_until = -math.inf
         restore_factory_settings(self._memory, self.plant)
         self._memory.set("modbus_id", address)
+        self._set_identity(serial_number)
         self._log = self._start_log(log_order)
         self._set_constants()
         self.day = SolarDay(
@@ -143,12 +144,60 @@ class SimulatedController(Controller):
             "supply_5v_voltage": 5.02,
             "gate_drive_voltage": 13.6,
             "meterbus_voltage": 11.8,
+            "supply_3v_voltage": 3.3,
+            "supply_1v8_voltage": 1.8,
+            "reference_voltage": 2.5,
         }
         for name, volts in supplies.items():
             self._memory.set(name, volts * dice.uniform(0.99, 1.01))
         self._memory.set("software_version", self._firmware)
         self._memory.set("settings_voltage_multiplier", self.plant.multiplier)
         self._memory.set("dip_switches", dice.randrange(0x80))
+        self._set_network()
+
+    def _set_scaling(self) -> None:
+        """What a unit that tells its own scaling tells; the parts have tolerances."""
+        dice = random.Random(f"{self._seed}/scaling")  # noqa: S311  tolerances of parts are no secret
+        self._memory.set("voltage_scaling", 180.0 * dice.uniform(0.995, 1.005))
+        self._memory.set("current_scaling", 80.0 * dice.uniform(0.995, 1.005))
+
+    def _set_identity(self, serial_number: str | None) -> None:
+        rules = self.map.identity
+        if serial_number is None and self._memory.has("serial_number"):
+            serial_number = f"1647{self._seed % 10_000:04d}"
+        if serial_number is not None and rules.serial_first is not None:
+            words = encode_text("ascii", serial_number, rules.serial_words, rules.serial_order)
+            self._memory.store(Space.REGISTERS, rules.serial_first, *words)
+        self._memory.set_text("hardware_version", "1.1")
+        if self.plant.product in rules.product_codes:
+            self._memory.set("controller_model", rules.product_codes.index(self.plant.product))
+
+    def _set_network(self) -> None:
+        """The network registers of a unit that has them, as it leaves the factory on a network without DHCP."""
+        memory, host = self._memory, 1 + self._seed % 250
+        for name, text in {
+            "ip_address": f"192.168.1.{host}",
+            "subnet_mask": "255.255.255.0",
+            "gateway_address": "192.168.1.1",
+            "dns_primary_address": "192.168.1.1",
+            "dns_secondary_address": "192.168.1.1",
+            "controller_id": "TriStar MPPT",
+            "mac_address": f"02:4d:53:00:00:{host:02x}",
+            "netbios_name": f"tsmppt1647{self._seed % 10_000:04d}",
+        }.items():
+            memory.set_text(name, text)
+        for name, value in {
+            "network_firmware_version": 8,
+            "network_flags": 0x4000,
+            "http_port": 80,
+            "modbus_tcp_port": 502,
+            "network_rules": 0,
+            "snmp_trap_port": 162,
+            "ethernet_power_save": 0,
+            "vlan_enable": 0,
+            "vlan_parameters": 1,
+        }.items():
+            memory.set(name, value)
 
     def _start_log(self, order: WordOrder) -> DailyLog | None:
         if self.map.log is None:
@@ -182,12 +231,7 @@ class SimulatedController(Controller):
 
 def _serial_extent(device_map: DeviceMap, serial_number: str | None) -> tuple[Extent, ...]:
     first = device_map.identity.serial_first
-    if serial_number is None or first is None:
+    if serial_number is None or first is None or device_map.covers(Space.REGISTERS, first, first + 1):
         return ()
     last = first + device_map.identity.serial_words - 1
     return (Extent("serial_number", Space.REGISTERS, first, last, PollClass.BACKGROUND, writable=False, doc="field"),)
-
-
-def _ascii_words(device_map: DeviceMap, text: str) -> list[int]:
-    data = text.encode("ascii").ljust(2 * device_map.identity.serial_words, b"\x00")
-    return [int.from_bytes(data[k : k + 2], "big") for k in range(0, 2 * device_map.identity.serial_words, 2)]

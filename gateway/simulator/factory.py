@@ -1,6 +1,7 @@
 """The settings a unit leaves the factory with, and the set points that follow from what its EEPROM holds.
 
-Voltages are for 12 V, as the EEPROM stores them; a 24 V unit multiplies them.
+Voltages here are for 12 V. A model whose map says that a point is multiplied stores them so and multiplies them itself;
+any other stores what holds for its battery.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ FACTORY_SETTINGS: Mapping[str, Value] = MappingProxyType(
         "equalize_interval": 28,
         "equalize_time_above_absorption": 10_800,
         "equalize_time": 7_200,
+        "battery_service_interval": 180,
         "charge_voltage_limit": 16.0,
         "temperature_compensation": 0.03,
         "battery_hvd_voltage": 16.0,
@@ -58,7 +60,7 @@ FACTORY_SETTINGS: Mapping[str, Value] = MappingProxyType(
 def restore_factory_settings(memory: Memory, plant: Plant) -> None:
     """Write every setting's factory value; current limits are the model's rating."""
     for name, value in FACTORY_SETTINGS.items():
-        memory.set(name, value)
+        memory.set(name, value * _stored_times(memory, name, plant))
     memory.set("battery_current_limit", plant.rated_a)
     memory.set("charge_current_limit", plant.rated_a)
 
@@ -71,7 +73,10 @@ def set_points(memory: Memory, plant: Plant) -> SetPoints:
         return 0.0 if value is None else float(value)
 
     def volts(name: str) -> float:
-        return plain(name) * plant.multiplier
+        return plain(name) * plant.multiplier / _stored_times(memory, name, plant)
+
+    def limit_a(name: str) -> float:
+        return plain(name) if memory.has(name) else plant.rated_a
 
     limits = [limit for name in ("charge_voltage_maximum", "charge_voltage_limit") if (limit := volts(name)) > 0]
     return SetPoints(
@@ -88,13 +93,13 @@ def set_points(memory: Memory, plant: Plant) -> SetPoints:
         equalize_above_s=plain("equalize_time_above_absorption"),
         equalize_at_s=plain("equalize_time"),
         reference_limit_v=min(limits, default=0.0),
-        tempcomp_v=plain("temperature_compensation"),
+        tempcomp_v=volts("temperature_compensation") / plant.multiplier,
         tempcomp_max_c=plain("compensation_temperature_maximum"),
         tempcomp_min_c=plain("compensation_temperature_minimum"),
         hvd_v=volts("battery_hvd_voltage"),
         hvr_v=volts("battery_hvr_voltage"),
-        charge_limit_a=plain("charge_current_limit"),
-        battery_limit_a=plain("battery_current_limit"),
+        charge_limit_a=limit_a("charge_current_limit"),
+        battery_limit_a=limit_a("battery_current_limit"),
         lvd_v=volts("load_lvd_voltage"),
         lvr_v=volts("load_lvr_voltage"),
         load_hvd_v=volts("load_hvd_voltage"),
@@ -108,3 +113,11 @@ def set_points(memory: Memory, plant: Plant) -> SetPoints:
             volts("led_yellow_red_to_red_voltage"),
         ),
     )
+
+
+def _stored_times(memory: Memory, name: str, plant: Plant) -> int:
+    """How many times the 12 V value the EEPROM holds."""
+    if not memory.has(name):
+        return 1
+    point = memory.point(name)
+    return plant.multiplier if point.unit in {"V", "V/°C"} and point.multiplied_by is None else 1

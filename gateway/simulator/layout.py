@@ -1,16 +1,17 @@
 """Which controllers hang on which line, and the controllers built from it.
 
-The default is the demo's: two lines, with a factory address 1 on each.
+The default is the demo's: two lines, with a factory address 1 on each, and a TriStar beside the ProStars.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from gateway.devices.model import DeviceMap
+from gateway.devices.schema import load_map, models
 from gateway.simulator.device import DEFAULT_TURNAROUND_S, SimulatedController
 from gateway.simulator.line import SimulatedLine
 from gateway.simulator.oracle import OracleController
@@ -24,27 +25,32 @@ _ADDRESSES = range(1, 248)
 
 @dataclass(frozen=True, slots=True)
 class LinePlan:
-    """A line's name and the addresses of its controllers."""
+    """A line's name and the addresses of its controllers, with the models of those that are not the site's own."""
 
     name: str
     addresses: tuple[int, ...]
+    models: Mapping[int, str] = field(default_factory=dict)  # address → model
 
     @classmethod
     def parse(cls, text: str) -> LinePlan:
-        """Read NAME=ADDR,ADDR; ValueError says what is wrong."""
+        """Read NAME=ADDR,ADDR:MODEL; ValueError says what is wrong."""
         name, separator, listed = text.partition("=")
         if not separator or not _NAME.fullmatch(name):
             raise ValueError(f"{text!r} is not NAME=ADDRESS,ADDRESS… (a name has letters, digits and . _ -)")
+        units = [unit.partition(":") for unit in listed.split(",")]
         try:
-            addresses = tuple(int(address) for address in listed.split(","))
+            addresses = tuple(int(address) for address, _, _ in units)
         except ValueError:
             raise ValueError(f"{text!r}: addresses are numbers separated by commas") from None
         if any(address not in _ADDRESSES for address in addresses):
             raise ValueError(f"{text!r}: an address is 1 to 247")
-        return cls(name, addresses)
+        named = {int(address): model for address, colon, model in units if colon}
+        if unknown := set(named.values()) - set(models()):
+            raise ValueError(f"{text!r}: no model is called {min(unknown)!r}; known: {', '.join(models())}")
+        return cls(name, addresses, named)
 
 
-DEMO_LAYOUT = (LinePlan("shelter-a", (1, 2)), LinePlan("shelter-b", (1,)))
+DEMO_LAYOUT = (LinePlan("shelter-a", (1, 2)), LinePlan("shelter-b", (1, 2), {2: "tristar-mppt"}))
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,14 +80,25 @@ class SimulatedSite:
         behaviour: Behaviour | None = None,
         link_dir: Path | None = None,
     ) -> SimulatedSite:
-        """Make everything; nothing is opened yet. ValueError when names repeat or the oracle has no room."""
+        """Make everything, of `device_map` where a plan names no model; nothing is opened yet.
+
+        ValueError when names repeat or the oracle has no room.
+        """
         how = behaviour or Behaviour()
         if len({plan.name for plan in plans}) != len(plans):
             raise ValueError("line names repeat")
         lines: list[PtyLine] = []
         controllers: list[Controller] = []
         for plan in plans:
-            stations = [_controller(device_map, how, len(controllers) + k, a) for k, a in enumerate(plan.addresses)]
+            stations = [
+                _controller(
+                    load_map(plan.models[address]) if address in plan.models else device_map,
+                    how,
+                    len(controllers) + k,
+                    address,
+                )
+                for k, address in enumerate(plan.addresses)
+            ]
             controllers += stations
             link = None if link_dir is None else link_dir / plan.name
             lines.append(PtyLine(SimulatedLine(stations, wake_bytes=_WAKE_BYTES), link=link))

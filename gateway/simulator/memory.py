@@ -2,32 +2,39 @@
 
 Every cell starts as 0, except those of the EEPROM, which start erased (0xFFFF) as a fresh part does: the
 document names 0xFFFF as one of the two forms of "not set". So reserved words read as 0 in RAM and as 0xFFFF in EEPROM.
+
+A point that the unit does not have, because its model or its product lacks it, is found by nobody and set in vain.
 """
 
 from __future__ import annotations
 
+import math
 from array import array
 
-from gateway.devices.codecs import decode, encode
-from gateway.devices.model import DeviceMap, Extent, Point, Space, Value
+from gateway.devices.codecs import read_words, write_words
+from gateway.devices.model import DeviceMap, Extent, Kind, Point, Space, Value
+from gateway.devices.texts import encode_text
 from gateway.simulator.server import missing
-
-EEPROM = "eeprom"
-"""Name of the extent that keeps settings without power."""
 
 ERASED = 0xFFFF
 
 
 class Memory:
-    """The cells of one unit, exactly the extents of its map."""
+    """The cells of one unit, exactly the extents of its map that its product has."""
 
-    def __init__(self, device_map: DeviceMap, extra: tuple[Extent, ...] = ()) -> None:
-        self._areas = [(extent, array("H", [0]) * extent.count) for extent in (*device_map.extents, *extra)]
+    def __init__(self, device_map: DeviceMap, extra: tuple[Extent, ...] = (), product: str = "") -> None:
+        there = [extent for extent in device_map.extents if device_map.on_product(extent, product)]
+        self._areas = [(extent, array("H", [0]) * extent.count) for extent in (*there, *extra)]
         for extent, cells in self._areas:
-            if extent.name == EEPROM:
+            if extent.wears:
                 cells[:] = array("H", [ERASED]) * extent.count
-        self._points = {point.name: point for point in device_map.points}
-        self._at = {(point.space, point.address + k): point for point in device_map.points for k in range(point.words)}
+        points = [
+            point
+            for point in device_map.points
+            if any(e.space is point.space and e.first <= point.address <= e.last for e in there)
+        ]
+        self._points = {point.name: point for point in points}
+        self._at = {(point.space, point.address + k): point for point in points for k in range(point.words)}
 
     def read(self, space: Space, first: int, count: int) -> list[int]:
         """The cells of a range; IllegalDataAddress unless all of them are there."""
@@ -59,24 +66,43 @@ class Memory:
     def in_eeprom(self, space: Space, address: int) -> bool:
         """Whether the address lies in the EEPROM."""
         return any(
-            extent.name == EEPROM and extent.space is space and extent.first <= address <= extent.last
+            extent.wears and extent.space is space and extent.first <= address <= extent.last
             for extent, _ in self._areas
         )
 
+    def has(self, name: str) -> bool:
+        """Whether the unit has a point of that name."""
+        return name in self._points
+
     def get(self, name: str) -> Value | None:
-        """The value of a point by the document's reading; None for "no value" (NaN)."""
-        point = self._points[name]
-        reading = point.reading()
+        """The value of a point by the document's reading; None for "no value" and for a point that is not there."""
+        point = self._points.get(name)
+        if point is None:
+            return None
         words = self.read(point.space, point.address, point.words)
-        if point.space is Space.COILS:
-            return words[0]
-        return decode(reading.codec, words, reading.order, reading.scale)
+        return read_words(point.reading(), words, self._scaling(point))
 
     def set(self, name: str, value: Value) -> None:
         """Store a value as the document says; NaN is the way to say "no value"."""
-        point = self._points[name]
+        point = self._points.get(name)
+        if point is None:
+            return
         if point.space is Space.COILS:
             self.store(point.space, point.address, int(value))
             return
         reading = point.reading()
-        self.store(point.space, point.address, *encode(reading.codec, value, point.words, reading.order, reading.scale))
+        if reading.absent and math.isnan(value):
+            self.store(point.space, point.address, min(reading.absent))
+        else:
+            self.store(point.space, point.address, *write_words(reading, value, point.words, self._scaling(point)))
+
+    def set_text(self, name: str, text: str) -> None:
+        """Store the text of a point that is one."""
+        point = self._points.get(name)
+        if point is not None and point.kind is Kind.TEXT:
+            reading = point.reading()
+            self.store(point.space, point.address, *encode_text(reading.codec, text, point.words, reading.order))
+
+    def _scaling(self, point: Point) -> dict[str, Value]:
+        found = ((name, self.get(name)) for name in point.reading().factors)
+        return {name: value for name, value in found if value is not None}

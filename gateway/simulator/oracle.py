@@ -20,8 +20,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from gateway.devices.codecs import decode
-from gateway.devices.model import DeviceMap, Point, Space, Value
+from gateway.devices.agreement import all_maps
+from gateway.devices.codecs import read_words
+from gateway.devices.model import DeviceMap, Point, Reading, Space, Value
 from gateway.errors import RequestError
 from gateway.modbus.pdu import exception_reply, parse_read
 from gateway.simulator.server import Controller, missing
@@ -34,6 +35,10 @@ _SPREAD = 0xACB5  # odd, so that multiplying is one-to-one and neighbours look u
 _STRIDE = 0x9E37  # odd, so that 65536 sequence numbers give as many keys
 _UNSPREAD = pow(_SPREAD, -1, _WORDS)
 _UNSTRIDE = pow(_STRIDE, -1, _WORDS)
+
+
+def _registers(device_map: DeviceMap) -> int:
+    return sum(extent.count for extent in device_map.extents if extent.space is Space.REGISTERS)
 
 
 class Verdict(StrEnum):
@@ -85,9 +90,11 @@ class OracleController(Controller):
         self._numbered: dict[int, Sample] = {}  # number modulo 65536 → sample
         registers = [extent for extent in device_map.extents if extent.space is Space.REGISTERS]
         self.addresses = tuple(address for extent in registers for address in range(extent.first, extent.last + 1))
-        if not 0 <= device < _WORDS // len(self.addresses):
+        # As much room for each as the largest model takes, so that models can be mixed.
+        room = max(len(self.addresses), *(_registers(each) for each in all_maps()))
+        if not 0 <= device < _WORDS // room:
             raise ValueError(f"no room for device {device}: its registers would repeat those of another")
-        first = device * len(self.addresses)
+        first = device * room
         self._slots = {address: first + position for position, address in enumerate(self.addresses)}
         coils = [extent for extent in device_map.extents if extent.space is Space.COILS]
         self.coil_addresses = tuple(address for extent in coils for address in range(extent.first, extent.last + 1))
@@ -112,7 +119,8 @@ class OracleController(Controller):
     def identification(self) -> Mapping[int, bytes]:
         """See `Controller.identification`; the revision carries the device number."""
         identity = self.map.identity
-        texts = (identity.vendor, identity.product_codes[0], f"v01.00.{self.device:02d}")
+        whole = (code for code in identity.product_codes if all(self.map.on_product(e, code) for e in self.map.extents))
+        texts = (identity.vendor, next(whole), f"v01.00.{self.device:02d}")
         return {number: text.encode("ascii") for number, text in enumerate(texts)}
 
     def read(self, space: Space, first: int, count: int, now: float) -> list[int]:
@@ -174,13 +182,25 @@ class OracleController(Controller):
             if point.space is Space.COILS:
                 held: Value | None = self.coil(point.address, sample.number)
             else:
-                words = [self.word(point.address + k, sample.number) for k in range(point.words)]
-                held = decode(form.codec, words, form.order, form.scale)
+                held = read_words(form, self._words_of(point, sample), self._scaling(form, sample))
             if held == value:
                 if sample.at >= read_at:
                     return Verdict.RIGHT
                 verdict = Verdict.LATE
         return verdict
+
+    def _words_of(self, point: Point, sample: Sample) -> list[int]:
+        return [self.word(point.address + k, sample.number) for k in range(point.words)]
+
+    def _scaling(self, form: Reading, sample: Sample) -> dict[str, Value]:
+        """What the same answer says of the scaling; a point scaled by another answer is not judged."""
+        points = [self.map.point(name) for name in form.factors]
+        found = (
+            (point.name, read_words(point.reading(), self._words_of(point, sample)))
+            for point in points
+            if sample.covers(point.space, point.address, point.words)
+        )
+        return {name: value for name, value in found if value is not None}
 
     def _remember(self, space: Space, first: int, count: int, now: float) -> None:
         self.sequence += 1

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 
-from gateway.devices.model import DeviceMap, Value
+from gateway.devices.model import DeviceMap, Point, Value
 from gateway.simulator.charger import CHARGING, ChargeStage, LoadStage
 from gateway.simulator.day import Masks, SolarDay
 from gateway.simulator.memory import Memory
 
 _NO_VALUE = math.nan
-_ENERGY_WRAP_KWH = 6_553.6  # 16 bits of 0.1 kWh
 _MAX_U16 = 65_535
 _STAGE_LEDS = {
     ChargeStage.ABSORPTION: "absorption",
     ChargeStage.FLOAT: "float",
     ChargeStage.EQUALIZE: "equalize",
 }
-_SOC_LEDS = ("green", "green_yellow", "yellow", "yellow_red", "red_blink")
+_SOC_LEDS = (("green",), ("green_yellow", "green"), ("yellow",), ("yellow_red", "yellow"), ("red_blink",))
+"""From a full battery to an empty one; a model without the first of two shows the second."""
 _STORED = {
     "stored_hourmeter": "hourmeter",
     "stored_load_charge_resettable": "load_charge_resettable",
@@ -33,23 +33,27 @@ _STORED = {
 
 
 class Labels:
-    """Numbers behind the map's labels: of enumerations and bits."""
+    """Numbers behind the map's labels, by point: of enumerations and bits."""
 
     def __init__(self, device_map: DeviceMap) -> None:
         self._numbers = {
-            (table, value.name): value.number for table, values in device_map.enumerations.items() for value in values
+            (point.name, value.name): value.number
+            for point in device_map.points
+            for value in device_map.enumerations.get(point.enumeration or "", ())
         }
         self._masks = {
-            (table, bit.name): 1 << bit.number for table, bits in device_map.bit_tables.items() for bit in bits
+            (point.name, bit.name): 1 << bit.number
+            for point in device_map.points
+            for bit in device_map.bit_tables.get(point.bits or "", ())
         }
 
-    def number(self, enumeration: str, label: str) -> int:
-        """The device's number of an enumeration value; KeyError when the map has no such label."""
-        return self._numbers[enumeration, label]
+    def number(self, point: str, *labels: str) -> int:
+        """The device's number of the first of these states that the model has; 0 when it has none of them."""
+        return next((self._numbers[point, label] for label in labels if (point, label) in self._numbers), 0)
 
-    def mask(self, table: str, label: str) -> int:
-        """The bit's mask; KeyError when the map has no such label."""
-        return self._masks[table, label]
+    def mask(self, point: str, label: str) -> int:
+        """The bit's mask; 0 when the model has no such bit."""
+        return self._masks.get((point, label), 0)
 
     def nature(self) -> Masks:
         """Masks of the causes a `SolarDay` finds."""
@@ -65,9 +69,10 @@ class Labels:
 
 def publish(day: SolarDay, memory: Memory, labels: Labels) -> None:
     """Write all measured, counted and decided values of this moment."""
-    values = {**_measured(day), **_decided(day, labels), **_counted(day)}
-    for name, value in values.items():
-        memory.set(name, value)
+    for values in (_measured(day), _decided(day, labels), _counted(day), _happened(day, labels)):
+        for name, value in values.items():
+            if memory.has(name):
+                memory.set(name, _wrapped(value, memory.point(name)))
 
 
 def store_totals(memory: Memory) -> None:
@@ -89,8 +94,10 @@ def _measured(day: SolarDay) -> dict[str, Value]:
         "battery_current_net": now.net_a,
         "load_current": now.load_a,
         "battery_sense_voltage": now.battery_v - 0.002 * now.net_a,
+        "battery_regulation_voltage": now.battery_v - 0.002 * now.net_a,
         "battery_voltage_slow_60s": now.battery_60s_v,
         "battery_current_net_slow_60s": now.net_60s_a,
+        "charge_current_slow_60s": now.charge_60s_a,
         "battery_voltage_slow_25s": now.battery_25s_v,
         "heatsink_temperature": now.heatsink_c,
         "battery_temperature": day.battery_c,
@@ -100,6 +107,7 @@ def _measured(day: SolarDay) -> dict[str, Value]:
         "inductor_v_temperature": now.inductor_c - 0.8,
         "inductor_w_temperature": now.inductor_c - 1.5 if plant.has_phase_w else _NO_VALUE,
         "charge_power": now.output_w,
+        "array_power": now.array_v * now.array_a,
         "sweep_vmp": now.sweep_vmp_v,
         "sweep_pmax": now.sweep_pmax_w,
         "sweep_voc": now.sweep_voc_v,
@@ -118,7 +126,7 @@ def _decided(day: SolarDay, labels: Labels) -> dict[str, Value]:
         "load_lvd_voltage_in_force": load.lvd_v(day.now.load_a, points),
         "load_hvd_voltage_in_force": points.load_hvd_v,
         "alarms": day.alarms,
-        "led_state": labels.number("led_state", _battery_led(day)),
+        "led_state": labels.number("led_state", *_battery_led(day)),
         "charge_led_state": labels.number("charge_led_state", _charge_led(day)),
         "equalize_triggered": day.orders.equalize,
         "load_disconnect_forced": day.orders.load_disconnect,
@@ -132,18 +140,22 @@ def _counted(day: SolarDay) -> dict[str, Value]:
     return {
         "charge_resettable": totals.charge_ah_r,
         "charge_total": totals.charge_ah,
-        "charge_energy_resettable": _wrapped(totals.charge_kwh_r),
-        "charge_energy_total": _wrapped(totals.charge_kwh),
+        "charge_energy_resettable": totals.charge_kwh_r,
+        "charge_energy_total": totals.charge_kwh,
         "load_charge_resettable": totals.load_ah_r,
         "load_charge_total": totals.load_ah,
         "hourmeter": int(day.hours),
+        "time_since_battery_service": int((day.hours - totals.service_at_h) / 24),
+        "battery_voltage_minimum": min(totals.battery_min_v, day.now.battery_v),
+        "battery_voltage_maximum": max(totals.battery_max_v, day.now.battery_v),
         "battery_voltage_minimum_today": min(today.battery_min_v, day.now.battery_v),
         "battery_voltage_maximum_today": max(today.battery_max_v, day.now.battery_v),
         "charge_today": today.charge_ah,
         "load_charge_today": today.load_ah,
-        "array_faults_today": today.array_faults,
-        "load_faults_today": today.load_faults,
-        "alarms_today": today.alarms,
+        "charge_energy_today": today.charge_kwh,
+        "charge_power_maximum_today": today.output_max_w,
+        "battery_temperature_minimum_today": min(today.battery_min_c, day.battery_c),
+        "battery_temperature_maximum_today": max(today.battery_max_c, day.battery_c),
         "absorption_time_today": min(_MAX_U16, today.absorption_s),
         "equalize_time_today": min(_MAX_U16, today.equalize_s),
         "float_time_today": min(_MAX_U16, today.float_s),
@@ -151,19 +163,42 @@ def _counted(day: SolarDay) -> dict[str, Value]:
     }
 
 
-def _wrapped(kwh: float) -> float:
-    # The nearest tenth of a value just below the wrap would be 65536 tenths.
-    return (round(kwh * 10) % round(_ENERGY_WRAP_KWH * 10)) / 10
+def _happened(day: SolarDay, labels: Labels) -> dict[str, Value]:
+    """The sticky bits of the day."""
+    today = day.today
+    reset = labels.mask("alarms", "reset")
+    flags = {
+        "reset": today.alarms & reset,
+        "equalize": today.equalize_s,
+        "float": today.float_s,
+        "alarm": today.alarms,
+        "fault": today.array_faults,
+    }
+    return {
+        "array_faults_today": today.array_faults,
+        "load_faults_today": today.load_faults,
+        "alarms_today": today.alarms,
+        "flags_today": sum(labels.mask("flags_today", name) for name, seen in flags.items() if seen),
+    }
 
 
-def _battery_led(day: SolarDay) -> str:
+def _wrapped(value: Value, point: Point) -> Value:
+    """Energy counters of one word begin anew when they are full."""
+    if point.unit != "kWh" or point.words > 1:
+        return value
+    scale = point.reading().scale
+    # The nearest step of a value just below the wrap would be 65536 steps.
+    return round(value / scale) % (_MAX_U16 + 1) * scale
+
+
+def _battery_led(day: SolarDay) -> tuple[str, ...]:
     if day.array_faults or day.load_faults:
-        return "error_r_y_g"
+        return ("error_r_y_g",)
     if day.load.stage is LoadStage.LVD:
-        return "red"
+        return ("red",)
     stage = _STAGE_LEDS.get(day.charger.stage)
     if stage is not None:
-        return stage
+        return (stage,)
     below = sum(day.now.battery_25s_v < limit for limit in day.points.led_limits_v)
     return _SOC_LEDS[below]
 

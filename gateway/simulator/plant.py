@@ -2,13 +2,15 @@
 
 The models are good enough that the numbers of a day hang together (power = voltage × current, a full battery takes
 less, a loaded one sags), and cheap enough to step a day in well under a second. Voltages are those of
-the whole battery, 12 V or 24 V nominal.
+the whole battery, 12 V, 24 V or 48 V nominal.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+
+from gateway.devices.model import DeviceMap
 
 _DARK = 0.002  # below this share of full sun an array gives no usable voltage
 
@@ -18,7 +20,7 @@ class Plant:
     """One installation: ratings of the controller and of what hangs on it."""
 
     product: str
-    nominal_v: int  # 12 or 24
+    nominal_v: int  # 12, 24 or 48
     rated_a: float  # charge current of the model
     array_w: float
     array_voc_v: float
@@ -34,7 +36,7 @@ class Plant:
 
     @property
     def multiplier(self) -> int:
-        """1 for 12 V, 2 for 24 V: what the 12 V settings are multiplied by."""
+        """1 for 12 V, 2 for 24 V, 4 for 48 V: what the 12 V settings are multiplied by."""
         return self.nominal_v // 12
 
     @property
@@ -92,8 +94,47 @@ PLANTS = (
         days_since_equalize=3,
         age_days=37,
     ),
+    Plant(
+        product="TS-MPPT-45",
+        nominal_v=24,
+        rated_a=45.0,
+        array_w=1_200.0,
+        array_voc_v=112.0,
+        battery_ah=380.0,
+        soc_at_start=0.66,
+        base_load_a=7.5,
+        lamp_a=5.0,
+        has_rts=False,
+        warmth_c=25.0,
+        heatsink_c_per_w=0.8,
+        days_since_equalize=20,
+        age_days=210,
+    ),
+    Plant(
+        product="TS-MPPT-60",
+        nominal_v=48,
+        rated_a=60.0,
+        array_w=2_900.0,
+        array_voc_v=128.0,
+        battery_ah=400.0,
+        soc_at_start=0.72,
+        base_load_a=9.5,
+        lamp_a=4.0,
+        has_rts=True,
+        warmth_c=22.0,
+        heatsink_c_per_w=0.35,
+        days_since_equalize=9,
+        age_days=1_300,
+    ),
 )
-"""Three unlike installations: a healthy 12 V one, a big 24 V one due for equalization, a tight one that reaches LVD."""
+"""Unlike installations. ProStars: a healthy 12 V one, a big 24 V one due for equalization, a tight one that meets LVD;
+TriStars, whose loads hang on the battery and not on them: a 24 V one without a remote sensor and a 48 V one.
+"""
+
+
+def plants_of(device_map: DeviceMap) -> tuple[Plant, ...]:
+    """The installations that a model can be bolted to."""
+    return tuple(plant for plant in PLANTS if device_map.identity.names(plant.product))
 
 
 @dataclass(frozen=True, slots=True)

@@ -120,8 +120,13 @@ def test_without_the_mib_the_commands_are_numeric(tmp_path: Path) -> None:
 
 
 def test_the_demo_has_the_simulators_layout_and_a_right_config(tmp_path: Path) -> None:
-    simulated = [(plan.name, plan.addresses) for plan in DEMO_LAYOUT]
-    assert [(line, tuple(address for _, address, _ in devices)) for line, devices in LAYOUT.items()] == simulated
+    simulated = [
+        (plan.name, address, plan.models.get(address, "prostar-mppt"))
+        for plan in DEMO_LAYOUT
+        for address in plan.addresses
+    ]
+    shown = [(line, address, model) for line, devices in LAYOUT.items() for _, address, _, model in devices]
+    assert shown == simulated
     text = demo_config(tmp_path, Ports(modbus=1502, snmp=1161, http=9850))
     config = parse_config(text)
     assert config.modbus.listen == ("127.0.0.1:1502",)

@@ -19,7 +19,7 @@ import pytest
 
 from tests.deploy.promtool import REPOSITORY, RULES
 from tests.e2e.conftest import start
-from tests.e2e.programs import GATEWAY, Program, wait_until, write_config
+from tests.e2e.programs import GATEWAY, MIXED_DEVICES, Program, wait_until, write_config
 
 __all__ = ["start"]
 
@@ -81,7 +81,7 @@ def server(peer: Callable[[str], str], tmp_path_factory: pytest.TempPathFactory)
         try:
             started.append(Program((*GATEWAY, "simulate", "--link-dir", str(folder))))
             wait_until(lambda: any(path.is_symlink() for path in folder.iterdir()), "the simulated lines")
-            write_config(folder / "site.toml", (gateway[0], gateway[1], gateway[2]))
+            write_config(folder / "site.toml", (gateway[0], gateway[1], gateway[2]), MIXED_DEVICES)
             started.append(Program((*GATEWAY, "run", "-c", str(folder / "site.toml"))))
             # Prometheus asks for targets when it starts, and then only once in a while.
             wait_until(lambda: _answers(f"http://127.0.0.1:{gateway[2]}/readyz"), "the gateway", SERVING_S)
@@ -98,7 +98,7 @@ def server(peer: Callable[[str], str], tmp_path_factory: pytest.TempPathFactory)
             try:
                 found = Server(f"http://127.0.0.1:{port}")
                 wait_until(lambda: _answers(f"{found.url}/-/ready"), "Prometheus", SERVING_S)
-                wait_until(lambda: len(found.query("morningstar_up == 1")) == 3, "three controllers", SERVING_S)
+                wait_until(lambda: len(found.query("morningstar_up == 1")) == 4, "all controllers", SERVING_S)
                 read_past_the_polls(gateway[0])
                 counted = "sum(prostar_gateway_line_client_seconds_total) > 0"
                 wait_until(lambda: found.query(counted), "the client's read", SERVING_S)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,9 @@ CHOSEN = {
     "$__range": "1m",
 }
 
+TRISTAR_CHOSEN = {**CHOSEN, "$line": "shelter-b", "$device": "array-4"}
+PER_12V = "device:morningstar_battery_voltage_volts:per_12v"
+
 
 def loaded(path: Path) -> dict[str, Any]:
     node: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -33,13 +36,13 @@ def panels(path: Path) -> list[dict[str, Any]]:
     return [panel for panel in loaded(path)["panels"] if panel["type"] != "row"]
 
 
-def queries() -> Iterator[tuple[str, str, str]]:
+def queries(chosen: Mapping[str, str] = CHOSEN) -> Iterator[tuple[str, str, str]]:
     """Dashboard, panel, expression with everything chosen."""
     for path in DASHBOARDS:
         for panel in panels(path):
             for target in panel["targets"]:
                 expr = target["expr"]
-                for variable, value in CHOSEN.items():
+                for variable, value in chosen.items():
                     expr = expr.replace(variable, value)
                 yield path.stem, panel["title"], expr
 
@@ -51,8 +54,25 @@ def test_the_dashboards_are_there() -> None:
 
 @pytest.mark.peer
 def test_every_query_gives_data(server: Server) -> None:
-    empty = [(where, title, expr) for where, title, expr in queries() if not server.query(expr)]
+    """Of a ProStar, or else of a TriStar: each has what the other has not."""
+    both = zip(queries(), queries(TRISTAR_CHOSEN), strict=True)
+    empty = [one for one, other in both if not server.query(one[2]) and not server.query(other[2])]
     assert empty == []
+
+
+@pytest.mark.peer
+@pytest.mark.parametrize("chosen", [CHOSEN, TRISTAR_CHOSEN], ids=["prostar", "tristar"])
+def test_what_comes_first_is_there_for_every_model(server: Server, chosen: Mapping[str, str]) -> None:
+    first = {"Reached", "Last reply", "Battery", "Charging", "Array", "Heatsink", "Voltages", "Currents", "Power"}
+    titles = {title for where, title, expr in queries(chosen) if where == "controller" and server.query(expr)}
+    assert first <= titles
+
+
+@pytest.mark.peer
+def test_what_a_battery_has_for_each_12_v_is_known_of_every_controller(server: Server) -> None:
+    found = {each["metric"]["device"]: float(each["value"][1]) for each in server.query(PER_12V)}
+    assert found.keys() == {"array-1", "array-2", "array-3", "array-4"}
+    assert all(10.5 < volts < 16 for volts in found.values())
 
 
 @pytest.mark.peer
@@ -69,7 +89,7 @@ def test_every_variable_has_values(server: Server) -> None:
             expected = {
                 "site": {"ridge-07"},
                 "line": {"shelter-a", "shelter-b"},
-                "device": {"array-1", "array-2", "array-3"},
+                "device": {"array-1", "array-2", "array-3", "array-4"},
             }
             assert values == expected[variable["name"]]
 

@@ -1,13 +1,12 @@
 from __future__ import annotations
 
 import math
-import struct
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.devices.codecs import CODECS, ascii_text, combine, decode, encode, separate
+from gateway.devices.codecs import CODECS, combine, decode, encode, separate
 from gateway.devices.model import Space, WordOrder
 
 HI_LO, LO_HI = WordOrder.HI_LO, WordOrder.LO_HI
@@ -162,19 +161,3 @@ def test_encode_takes_the_nearest_step() -> None:
 @given(st.integers(0, 2**32 - 1), st.sampled_from(WordOrder))
 def test_separate_undoes_combine(raw: int, order: WordOrder) -> None:
     assert combine(separate(raw, 2, order), order) == raw
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        (b"12345678", "12345678"),
-        (b"1234\0\0\0\0", "1234"),
-        (b"12345   ", "12345"),
-        (b"\xff" * 8, None),
-        (b"\0" * 8, None),
-        (b"12\x0145678", None),
-        (b"1234567\xe9", None),
-    ],
-)
-def test_text_is_printable_ascii_or_nothing(text: bytes, expected: str | None) -> None:
-    assert ascii_text(struct.unpack(">4H", text)) == expected

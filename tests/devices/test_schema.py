@@ -59,7 +59,7 @@ def _load(point: str, disconnected: str, connected: str) -> tuple[str, str]:
     [
         ('symbol = "vb"', 'symbol = "vb"\ncolour = "red"', "point battery_voltage: colour: Extra"),
         ('symbol = "vb"', "", "point battery_voltage: symbol: Field required"),
-        ("words = 2\nsymbol", "words = 3\nsymbol", "point energy_total: words"),
+        ("words = 2\nsymbol", "words = 9\nsymbol", "point energy_total: words"),
         ("address = 0x0004", 'address = "4"', "point charge_state: address"),
         ("address = 0x0004", "address = 0x10000", "point charge_state: address"),
         ("address = 0x0004", "address = true", "point charge_state: address"),

@@ -1,6 +1,6 @@
-"""The demo's three controllers on two ptys at 115200 8N2: `simulate --oracle`, twelve times as fast.
+"""The demo's four controllers on two ptys at 115200 8N2: `simulate --oracle`, twelve times as fast.
 
-Reading all 4514 registers of three controllers twice takes minutes at 9600 baud; what a register holds is the same.
+Reading all registers of the controllers twice takes minutes at 9600 baud; what a register holds is the same.
 With `plants` behind the folder they are `simulate` without `--oracle`: a solar day, and a daily log.
 """
 
@@ -21,17 +21,19 @@ from gateway.simulator.oracle import OracleController
 from gateway.simulator.pty import PtyLine
 
 BAUDRATE = 115200
-LAYOUT = {"shelter-a": (1, 2), "shelter-b": (1,)}
+LAYOUT = {
+    "shelter-a": ((1, "prostar-mppt"), (2, "prostar-mppt")),
+    "shelter-b": ((1, "prostar-mppt"), (2, "tristar-mppt")),
+}
 
 
 def controllers() -> dict[str, list[OracleController]]:
     """The controllers by line; each has registers of its own, so that no word is like another's."""
-    device_map = load_map("prostar-mppt")
     found: dict[str, list[OracleController]] = {}
     number = 0
-    for line, addresses in LAYOUT.items():
-        for address in addresses:
-            found.setdefault(line, []).append(OracleController(device_map, device=number, address=address))
+    for line, units in LAYOUT.items():
+        for address, model in units:
+            found.setdefault(line, []).append(OracleController(load_map(model), device=number, address=address))
             number += 1
     return found
 

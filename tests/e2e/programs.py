@@ -13,7 +13,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +23,11 @@ REPOSITORY = Path(__file__).parents[2]
 GATEWAY = (sys.executable, "-m", "gateway")
 DEMO_DEVICES = (("shelter-a", "array-1", 1, 11), ("shelter-a", "array-2", 2, 12), ("shelter-b", "array-3", 1, 13))
 """Line, name, address, unit id: two lines, three controllers, the factory address 1 on both lines."""
+
+MIXED_DEVICES = (*DEMO_DEVICES, ("shelter-b", "array-4", 2, 14))
+"""The same with the TriStar that `simulate` has beside them."""
+
+MODELS: Mapping[str, str] = {"array-4": "tristar-mppt"}
 
 
 class Program:
@@ -149,8 +154,9 @@ def write_config(
     rest: str = "",
     *,
     modbus_keys: str = "",
+    models: Mapping[str, str] = MODELS,
 ) -> None:
-    """A configuration whose lines are links in the folder of the file."""
+    """A configuration whose lines are links in the folder of the file; `models` by name, ProStars else."""
     modbus, snmp, http = ports
     text = f'site = "ridge-07"\nstate_dir = "{path.parent / "state"}"\n'
     for line in dict.fromkeys(device[0] for device in devices):
@@ -158,7 +164,7 @@ def write_config(
         for at, name, address, unit in devices:
             if at == line:
                 text += f'[[line.device]]\nname = "{name}"\naddress = {address}\nunit_id = {unit}\n'
-                text += 'model = "prostar-mppt"\n'
+                text += f'model = "{models.get(name, "prostar-mppt")}"\n'
     text += f'[modbus]\nlisten = ["127.0.0.1:{modbus}"]\n{modbus_keys}\n[http]\nlisten = ["127.0.0.1:{http}"]\n'
     text += f'[snmp]\nlisten = ["127.0.0.1:{snmp}"]\n'
     text += '[[snmp.community]]\nname = "public"\nsource = ["127.0.0.0/8"]\n'

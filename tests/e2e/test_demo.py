@@ -117,7 +117,7 @@ def test_the_printed_commands_work_and_ctrl_c_leaves_nothing(
     for program in ("mbpoll", "snmpwalk", "snmptable", "curl"):
         peer(program)
     demo = terminal(columns=80, rows=24)
-    demo.wait_for(r"13 +array-3[^\n]*online(.|\n)*shelter-b +up +\d+%")
+    demo.wait_for(r"14 +array-4[^\n]*online(.|\n)*shelter-b +up +\d+%(.|\n)*/readyz")
     commands = list(dict.fromkeys(COMMAND.findall(demo.text())))
     assert [command.split()[0] for command in commands] == ["mbpoll", "mbpoll", "snmpwalk", "snmptable", "curl", "curl"]
     # Its own words cut at the width of the terminal are the ones that would be pasted.
@@ -176,7 +176,7 @@ def test_without_a_terminal_there_are_plain_lines(ports: list[str]) -> None:
     assert said == ""
     assert sum(COMMAND.match(line) is not None for line in shown) == 6
     assert "\x1b" not in "".join(shown)
-    assert re.match(r"shelter-a/array-1 unit=11 battery=[\d.]+V/-?[\d.]+A array=", shown[-5])
+    assert re.match(r"shelter-a/array-1 unit=11 battery=[\d.]+V/-?[\d.]+A array=", shown[-6])
 
 
 def test_a_reader_that_leaves_ends_it(ports: list[str]) -> None:

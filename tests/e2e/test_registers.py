@@ -1,4 +1,4 @@
-"""Every register and coil of the document, read through the gateway by two unrelated clients, of three controllers.
+"""Every register and coil of the documents, read through the gateway by two unrelated clients, of four controllers.
 
 The controllers' registers all differ (simulator/oracle.py), two of them share an address on different lines: a word
 of another controller, register or moment cannot pass.
@@ -19,9 +19,18 @@ from gateway.devices.model import Extent, Space
 from gateway.devices.schema import load_map
 from gateway.simulator.oracle import OracleController
 from tests.e2e.fast_lines import BAUDRATE, controllers
-from tests.e2e.programs import DEMO_DEVICES, Launch, Running, Start, environment, wait_until
+from tests.e2e.programs import MIXED_DEVICES, Launch, Running, Start, environment, wait_until
 
-DOCUMENT = {"ram": (0x0000, 0x0051), "eeprom": (0xE000, 0xE04F), "log": (0x8000, 0x8FFF), "coils": (0x00, 0xFF)}
+DOCUMENTS = {
+    "prostar-mppt": {
+        Space.REGISTERS: [(0x0000, 0x0051), (0xE000, 0xE04F), (0x8000, 0x8FFF)],
+        Space.COILS: [(0x00, 0xFF)],
+    },
+    "tristar-mppt": {
+        Space.REGISTERS: [(0x0000, 0x005B), (0x1000, 0x1030), (0x151B, 0x1521), (0xE000, 0xE0CD)],
+        Space.COILS: [(0x00, 0xFF), (0x1000, 0x1003), (0x10FF, 0x10FF)],
+    },
+}
 LARGEST = 125  # what mbpoll asks at most, of coils too
 
 
@@ -39,10 +48,11 @@ def held(oracle: OracleController, extent: Extent, first: int, count: int) -> li
 
 @pytest.fixture
 def fast_site(launch: Launch, start: Start, tmp_path: Path) -> Running:
-    """A gateway over the three oracle controllers; polling leaves the lines to the clients."""
+    """A gateway over the oracle controllers; polling leaves the lines to the clients."""
     start(sys.executable, "-m", "tests.e2e.fast_lines", str(tmp_path))
     wait_until((tmp_path / "shelter-b").exists, "the fast lines")
-    site = launch(simulate=None, line_keys=f"baudrate = {BAUDRATE}", rest="[poll]\nlive_s = 5.0\n")
+    keys = f"baudrate = {BAUDRATE}"
+    site = launch(simulate=None, devices=MIXED_DEVICES, line_keys=keys, rest="[poll]\nlive_s = 5.0\n")
     site.wait_online()
     return site
 
@@ -50,16 +60,16 @@ def fast_site(launch: Launch, start: Start, tmp_path: Path) -> Running:
 def by_unit() -> dict[int, OracleController]:
     """The oracle of each unit id."""
     flat = [oracle for stations in controllers().values() for oracle in stations]
-    return dict(zip((unit for _, _, _, unit in DEMO_DEVICES), flat, strict=True))
+    return dict(zip((unit for _, _, _, unit in MIXED_DEVICES), flat, strict=True))
 
 
-def test_the_map_has_every_register_of_the_document() -> None:
+@pytest.mark.parametrize("model", DOCUMENTS)
+def test_the_map_has_every_register_of_the_document(model: str) -> None:
     spans: dict[Space, set[int]] = {Space.REGISTERS: set(), Space.COILS: set()}
-    for extent in load_map("prostar-mppt").extents:
+    for extent in load_map(model).extents:
         spans[extent.space] |= set(range(extent.first, extent.last + 1))
-    for name, (first, last) in DOCUMENT.items():
-        space = Space.COILS if name == "coils" else Space.REGISTERS
-        assert set(range(first, last + 1)) <= spans[space], name
+    for space, ranges in DOCUMENTS[model].items():
+        assert {address for first, last in ranges for address in range(first, last + 1)} == spans[space]
 
 
 @pytest.mark.peer
@@ -79,7 +89,7 @@ def test_mbpoll_reads_what_each_controller_holds(fast_site: Running, peer: Calla
                 base = 10 if extent.space is Space.COILS else 16
                 assert [int(value, base) for _, value in shown] == held(oracle, extent, first, count)
                 read += count
-    assert read >= 3 * (82 + 80 + 4096 + 256)
+    assert read >= 3 * (82 + 80 + 4096 + 256) + 92 + 49 + 7 + 206 + 256 + 5
 
 
 def test_pymodbus_reads_what_each_controller_holds(fast_site: Running) -> None:
@@ -100,10 +110,10 @@ def test_pymodbus_reads_what_each_controller_holds(fast_site: Running) -> None:
                         values = reply.bits[:count] if extent.space is Space.COILS else reply.registers
                         assert [int(value) for value in values] == held(oracle, extent, first, count)
                         read += count
-            assert client.read_holding_registers(0x0052, count=1, device_id=unit).exception_code == 2
+            assert client.read_holding_registers(0x005C, count=1, device_id=unit).exception_code == 2
             information = client.read_device_information(device_id=unit)
             assert dict(information.information) == oracle.identification()
-    assert read >= 3 * 2 * (82 + 80 + 256) + 3 * 4096
+    assert read >= 3 * 2 * (82 + 80 + 256) + 3 * 4096 + 2 * (92 + 49 + 7 + 206 + 256 + 5)
 
 
 def test_nobody_can_write(fast_site: Running) -> None:

@@ -24,14 +24,18 @@ def links(folder: Path) -> list[Path]:
 
 
 def test_the_default_layout_has_factory_address_1_on_two_lines() -> None:
-    assert [(plan.name, plan.addresses) for plan in DEMO_LAYOUT] == [("shelter-a", (1, 2)), ("shelter-b", (1,))]
+    assert [(plan.name, plan.addresses) for plan in DEMO_LAYOUT] == [("shelter-a", (1, 2)), ("shelter-b", (1, 2))]
+    assert [plan.models for plan in DEMO_LAYOUT] == [{}, {2: "tristar-mppt"}]
 
 
 def test_lines_are_written_as_name_and_addresses() -> None:
     assert LinePlan.parse("hut=1,2,17") == LinePlan("hut", (1, 2, 17))
+    assert LinePlan.parse("hut=1,2:tristar-mppt") == LinePlan("hut", (1, 2), {2: "tristar-mppt"})
 
 
-@pytest.mark.parametrize("text", ["hut", "=1", "hut=", "hut=1,", "hut=x", "hut=0", "hut=248", "a/b=1", "..=1", ".=1"])
+@pytest.mark.parametrize(
+    "text", ["hut", "=1", "hut=", "hut=1,", "hut=x", "hut=0", "hut=248", "a/b=1", "..=1", ".=1", "hut=1:", "hut=1:pwm"]
+)
 def test_wrong_lines_are_refused_with_their_text(text: str) -> None:
     with pytest.raises(ValueError, match=r"hut|=1"):
         LinePlan.parse(text)
@@ -45,7 +49,10 @@ def test_repeated_names_are_refused(prostar_map: DeviceMap) -> None:
 def test_every_controller_of_a_site_is_another(prostar_map: DeviceMap) -> None:
     site = SimulatedSite.build(prostar_map, behaviour=Behaviour(oracle=True))
     units = [unit for unit in site.controllers if isinstance(unit, OracleController)]
-    assert [(unit.device, unit.address) for unit in units] == [(0, 1), (1, 2), (2, 1)]
+    assert [(unit.device, unit.address) for unit in units] == [(0, 1), (1, 2), (2, 1), (3, 2)]
+    assert [unit.map.model for unit in units] == [*["prostar-mppt"] * 3, "tristar-mppt"]
+    words = [unit.word(address) for unit in units for address in unit.addresses]
+    assert len(words) == len(set(words)), "also of different models no two registers are alike"
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -65,8 +72,18 @@ async def test_it_prints_its_ports_serves_them_and_ends_at_once(tmp_path: Path, 
         told = json.loads(await program.stdout.readline())
         assert told == {
             "lines": [
-                {"name": "shelter-a", "port": str(tmp_path / "shelter-a"), "addresses": [1, 2]},
-                {"name": "shelter-b", "port": str(tmp_path / "shelter-b"), "addresses": [1]},
+                {
+                    "name": "shelter-a",
+                    "port": str(tmp_path / "shelter-a"),
+                    "addresses": [1, 2],
+                    "models": ["prostar-mppt"] * 2,
+                },
+                {
+                    "name": "shelter-b",
+                    "port": str(tmp_path / "shelter-b"),
+                    "addresses": [1, 2],
+                    "models": ["prostar-mppt", "tristar-mppt"],
+                },
             ]
         }
 

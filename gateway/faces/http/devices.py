@@ -5,7 +5,8 @@ that no line in a graph goes on flat. What says so (`morningstar_up`, the state,
 
 An enumeration is one series a state with the label `state`, 1 for the one that holds, else 0. A bit field is
 one series a named bit with the label `bit`. A number or a set bit that the map does not name has a series
-while it lasts (`value_17`, `bit_9`), so that it cannot pass unseen.
+while it lasts (`value_17`, `bit_9`), so that it cannot pass unseen. A text is one series of 1, with the text in a label
+that is called as the point is.
 
 A scrape costs what has changed: a device's lines are kept, and when its snapshot was replaced only those of
 points whose value is another one are written anew. All lines of a device in one scrape are of one snapshot.
@@ -19,7 +20,7 @@ from typing import Protocol
 
 from gateway.core.site import Device, Site
 from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN, DeviceState, Snapshot
-from gateway.devices.model import DeviceMap, Point, Value
+from gateway.devices.model import DeviceMap, Kind, Point, Value
 from gateway.errors import MapError
 from gateway.faces.http.metric import Labels, MetricInfo, MetricKind, gauge
 from gateway.faces.http.text import Lines, escaped, label_pairs, number, sample_lines
@@ -76,13 +77,15 @@ def point_metric(point: Point) -> MetricInfo | None:
         labels = (*DEVICE_LABELS, "state")
     elif point.bits is not None:
         labels = (*DEVICE_LABELS, "bit")
+    elif point.kind is Kind.TEXT:
+        labels = (*DEVICE_LABELS, point.name)
     return MetricInfo(point.metric, kind, point.help, labels)
 
 
 class _Writer(Protocol):
     """How a point that is more than one series becomes lines."""
 
-    def lines(self, labels: bytes, value: Value) -> bytes:
+    def lines(self, labels: bytes, value: Value | str) -> bytes:
         """The lines of the point's present value; `labels` are the device's."""
         ...
 
@@ -92,7 +95,7 @@ class _OneOf:
         self._begin = f"{metric}{{".encode()
         self._names = {code: escaped(name).encode() for code, name in names.items()}
 
-    def lines(self, labels: bytes, value: Value) -> bytes:
+    def lines(self, labels: bytes, value: Value | str) -> bytes:
         begin = b'%b%b,state="' % (self._begin, labels)
         out = [b'%b%b"} %d.0\n' % (begin, name, code == value) for code, name in self._names.items()]
         if value not in self._names:
@@ -105,7 +108,7 @@ class _Bits:
         self._begin = f"{metric}{{".encode()
         self._names = {bit: escaped(name).encode() for bit, name in names.items()}
 
-    def lines(self, labels: bytes, value: Value) -> bytes:
+    def lines(self, labels: bytes, value: Value | str) -> bytes:
         bits = int(value)
         begin = b'%b%b,bit="' % (self._begin, labels)
         named = [b'%b%b"} %d.0\n' % (begin, name, bits >> bit & 1) for bit, name in self._names.items()]
@@ -117,19 +120,31 @@ class _Bits:
         return b"".join(named + unnamed)
 
 
+class _Text:
+    def __init__(self, metric: str, label: str) -> None:
+        self._begin = f"{metric}{{".encode()
+        self._label = label.encode()
+
+    def lines(self, labels: bytes, value: Value | str) -> bytes:
+        return b'%b%b,%b="%b"} 1.0\n' % (self._begin, labels, self._label, escaped(str(value)).encode())
+
+
 def _writer(model: DeviceMap, point: Point, metric: str) -> _Writer | None:
     if point.enumeration is not None:
         return _OneOf(metric, {entry.number: entry.name for entry in model.enumerations[point.enumeration]})
     if point.bits is not None:
         return _Bits(metric, {bit.number: bit.name for bit in model.bit_tables[point.bits]})
+    if point.kind is Kind.TEXT:
+        return _Text(metric, point.name)
     return None
 
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """How the points of one model are written: columns with one entry a point."""
+    """How the points of one model are written: columns with one entry a point, first `points`, then `texts`."""
 
     points: tuple[str, ...]
+    texts: tuple[str, ...]
     families: tuple[int, ...]
     begins: tuple[bytes, ...]  # how a plain number's line begins
     scales: tuple[float, ...]  # what a plain number is multiplied by
@@ -144,7 +159,7 @@ class _DeviceLines:
         self.labels = labels
         self._plan = plan
         self._begins = tuple(begin + labels + b"}" for begin in plan.begins)
-        self._values: list[Value | None] = [None] * len(plan.points)
+        self._values: list[Value | str | None] = [None] * (len(plan.points) + len(plan.texts))
         self._lines: Lines = (b"",) * families
         self._written: Snapshot | None = None
 
@@ -158,17 +173,19 @@ class _DeviceLines:
         if before is None or _status(before) != _status(snapshot):
             lines[: len(DEVICE_METRICS)] = _status_lines(self.labels, snapshot)
         plan = self._plan
-        values = list(map(snapshot.shown().get, plan.points))
+        values: list[Value | str | None] = list(map(snapshot.shown().get, plan.points))
+        if plan.texts:
+            values += map(snapshot.shown_texts().get, plan.texts)
         columns = (values, self._values, plan.families, self._begins, plan.scales, plan.writers)
         # The one loop that runs for every value of every device: tens of thousands of times a scrape.
         for value, old, family, begin, scale, writer in zip(*columns, strict=True):
             if value != old:
                 if value is None:
                     lines[family] = b""
-                elif writer is None:
-                    lines[family] = begin + number(value * scale)
-                else:
+                elif writer is not None:
                     lines[family] = writer.lines(self.labels, value)
+                elif not isinstance(value, str):
+                    lines[family] = begin + number(value * scale)
         self._values = values
         self._written = snapshot
         self._lines = lines
@@ -220,7 +237,7 @@ class DeviceMetrics:
 
     def _plan(self, model: DeviceMap) -> _Plan:
         columns: list[tuple[str, int, bytes, float, _Writer | None]] = []
-        for point in model.points:
+        for point in sorted(model.points, key=lambda point: point.kind is Kind.TEXT):
             info = point_metric(point)
             if info is None:
                 continue
@@ -231,9 +248,10 @@ class DeviceMetrics:
             begin = f"{info.name}{{".encode()
             columns.append((point.name, family, begin, point.metric_scale, _writer(model, point, info.name)))
         if not columns:
-            return _Plan((), (), (), (), ())
+            return _Plan((), (), (), (), (), ())
         points, families, begins, scales, writers = zip(*columns, strict=True)
-        return _Plan(points, families, begins, scales, writers)
+        texts = tuple(name for name, *_, writer in columns if isinstance(writer, _Text))
+        return _Plan(points[: len(points) - len(texts)], texts, families, begins, scales, writers)
 
     def write(self) -> Iterator[Lines]:
         """Each device's lines, written as far as they changed; a step of the iteration is one device."""

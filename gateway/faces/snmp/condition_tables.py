@@ -45,7 +45,8 @@ INDEXES = (
         1,
         65535,
         "Number of the condition: 100 + the bit of an array fault, 200 + the bit of a load fault, 300 + the bit of an "
-        "alarm, 401 to 449 what the gateway sees of a device, 451 to 499 of itself, 1000 + the index of a line.",
+        "alarm, 500 + the bit of a fault of a TriStar, 600 + the bit of its alarm, 401 to 449 what the gateway sees of "
+        "a device, 451 to 499 of itself, 1000 + the index of a line.",
     ),
 )
 

@@ -23,8 +23,8 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from gateway.devices.agreement import all_maps
 from gateway.devices.model import Bit, DeviceMap, EnumValue, Group, Point
-from gateway.devices.schema import load_map, models
 from gateway.errors import MapError
 from gateway.faces.snmp import condition_tables, notifications, tables
 from gateway.faces.snmp.objects import (
@@ -38,6 +38,7 @@ from gateway.faces.snmp.objects import (
     Syntax,
     Table,
     in_range,
+    text,
 )
 from gateway.faces.snmp.settings import DEFAULT_ROOT, Oid
 
@@ -176,7 +177,7 @@ def layout(maps: Iterable[DeviceMap], root: Oid = DEFAULT_ROOT) -> Layout:
 
 def shipped_layout(root: Oid = DEFAULT_ROOT) -> Layout:
     """The MIB of every model that the gateway knows, under `root`."""
-    return layout((load_map(model) for model in models()), root)
+    return layout(all_maps(), root)
 
 
 def camel(words: str) -> str:
@@ -198,6 +199,12 @@ def object_name(point: str) -> str:
     return name
 
 
+def column_name(point: Point) -> str:
+    """Descriptor of the column that a point with a MIB entry has: its own name's, or that of what the map calls it."""
+    named = None if point.mib is None else point.mib.named
+    return object_name(named or point.name)
+
+
 def label(name: str) -> str:
     """`night_check` as the SMIv2 label `nightCheck`; MapError when it cannot be one."""
     words = camel(name)
@@ -213,7 +220,7 @@ class _Columns:
     def __init__(self, maps: Sequence[DeviceMap]) -> None:
         self._conventions = _conventions(maps)
         self._columns: dict[tuple[Group, int], ObjectType] = {}
-        self._numbers: dict[str, tuple[Group, int]] = {}
+        self._numbers: dict[str, tuple[Group, int]] = {}  # by what the object is called after
         self._scales: dict[str, int] = {}
         for device_map in maps:
             for point in device_map.points:
@@ -230,7 +237,7 @@ class _Columns:
         where = f"{device_map.model}: point {point.name}"
         if point.mib.column < 2:
             raise MapError(f"{where}: column {point.mib.column}; allowed: 2 and above (1 is the index)")
-        if self._numbers.setdefault(point.name, key) != key:
+        if self._numbers.setdefault(point.mib.named or point.name, key) != key:
             raise MapError(f"{where}: another model has it in another table or column")
         if self._scales.setdefault(point.name, point.mib.scale) != point.mib.scale:
             raise MapError(f"{where}: another model has it with another scale")
@@ -248,7 +255,7 @@ class _Columns:
     def _column(self, device_map: DeviceMap, point: Point, where: str) -> ObjectType:
         assert point.mib is not None
         try:
-            syntax = Syntax(point.mib.syntax)
+            syntax = Syntax.TEXT if point.mib.syntax == "Text" else Syntax(point.mib.syntax)
         except ValueError:
             raise MapError(f"{where}: syntax {point.mib.syntax!r} is not known") from None
         convention = None
@@ -259,13 +266,15 @@ class _Columns:
         elif syntax is Syntax.ENUMERATION:
             convention = self._convention(point.enumeration, where)
             get = _number_getter(point.name, 1, syntax)
+        elif syntax is Syntax.TEXT:
+            get = _text_getter(point.name)
         elif syntax in {Syntax.INTEGER32, Syntax.UNSIGNED32}:
             get = _number_getter(point.name, point.mib.scale, syntax)
         else:
             raise MapError(f"{where}: syntax {syntax} is not for points")
         return ObjectType(
             point.mib.column,
-            object_name(point.name),
+            column_name(point),
             syntax,
             point.help,
             get,
@@ -306,13 +315,21 @@ def _conventions(maps: Sequence[DeviceMap]) -> dict[str, Convention]:
             # A suffix, because a type and an object may not differ in the case of one letter only.
             "Pgw" + camel(key) + ("Code" if syntaxes[key] is Syntax.ENUMERATION else "Bits"),
             syntaxes[key],
-            tuple((number, known[number][0]) for number in sorted(known)),
+            _labels(known, syntaxes[key]),
             "Numbers are the device's own. "
             + "; ".join(f"{known[number][0]}({number}): {known[number][1]}" for number in sorted(known))
             + ".",
         )
         for key, known in labels.items()
     }
+
+
+def _labels(known: Mapping[int, tuple[str, str]], syntax: Syntax) -> tuple[tuple[int, str], ...]:
+    """Number and label; RFC 2578 wants a BITS to begin with bit 0, so that has one where the map names none."""
+    named = {number: name for number, (name, _) in known.items()}
+    if syntax is Syntax.BITS:
+        named.setdefault(0, "reserved0")
+    return tuple((number, named[number]) for number in sorted(named))
 
 
 def _number_getter(point: str, scale: int, syntax: Syntax) -> Callable[[DeviceRow, float], CellValue]:
@@ -322,6 +339,14 @@ def _number_getter(point: str, scale: int, syntax: Syntax) -> Callable[[DeviceRo
             return None
         number = round(value * scale)
         return number if in_range(syntax, number) else None
+
+    return get
+
+
+def _text_getter(point: str) -> Callable[[DeviceRow, float], CellValue]:
+    def get(row: DeviceRow, _now: float) -> CellValue:
+        value = row.device.snapshot.shown_texts().get(point)
+        return None if value is None else text(value)
 
     return get
 

@@ -135,7 +135,9 @@ class Window:
     def _leap(self, number: int) -> int:
         """The first column from this one on that is not of a point that no device shows."""
         if self._next_shown is None:
-            shown: set[str] = set().union(*(device.snapshot.shown() for device in self._devices))
+            snapshots = [device.snapshot for device in self._devices]
+            shown: set[str] = set().union(*(each.shown() for each in snapshots))
+            shown.update(*(each.shown_texts() for each in snapshots))
             ahead = len(self.columns)
             found = [ahead]
             for at in range(len(self.columns) - 1, -1, -1):

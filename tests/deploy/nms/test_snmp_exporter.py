@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from gateway.core.site import Device
-from gateway.devices.model import Point
+from gateway.devices.model import Kind, Point
 from gateway.devices.schema import load_map, models
 from gateway.generate.snmp_exporter import metric_of
 from tests.deploy.nms.conftest import COMMUNITY, SILENT, Plant
@@ -113,6 +113,9 @@ async def test_every_point_has_its_name_its_unit_and_its_value(scrape: Scrape, p
             for point in shown_points(device, settings=module == MODULES[1]):
                 assert point.mib is not None
                 name, power = metric_of(point)
+                if point.kind is Kind.TEXT:
+                    assert found[name, of(device, **{name: device.snapshot.texts[point.name]})] == 1
+                    continue
                 value = device.snapshot.values[point.name]
                 if point.enumeration is not None:
                     names = {each.number: each.name for each in device.map.enumerations[point.enumeration]}

@@ -17,7 +17,7 @@ from gateway.clock import Clock
 from gateway.core.histogram import Histogram
 from gateway.core.site import Site
 from gateway.core.snapshot import DeviceState
-from gateway.devices.model import DeviceMap, Point, Value
+from gateway.devices.model import DeviceMap, Kind, Point, Value
 from gateway.faces.http.devices import AGE, CONDITION, CONDITIONS, DEVICE_LABELS, INFO, STATE, UP, point_metric
 from gateway.faces.http.history import DEVICE_HISTORY_RULES, STORE_RULES, DeviceHistoryView
 from gateway.faces.http.lines import DEVICE_RULES, LINE_RULES, LineView
@@ -143,7 +143,8 @@ class Reference:
         for device, labels in zip(self._site.devices, self._labels(), strict=True):
             for point in device.map.points:
                 info = point_metric(point)
-                value = device.snapshot.shown().get(point.name)
+                shown = device.snapshot.shown_texts() if point.kind is Kind.TEXT else device.snapshot.shown()
+                value = shown.get(point.name)
                 if info is not None and value is not None:
                     infos.setdefault(info.name, info)
                     samples.setdefault(info.name, []).extend(_point_samples(device.map, point, labels, value))
@@ -151,8 +152,10 @@ class Reference:
             yield info, samples[name]
 
 
-def _point_samples(device_map: DeviceMap, point: Point, labels: Labels, value: Value) -> Iterator[Sample]:
-    if point.enumeration is not None:
+def _point_samples(device_map: DeviceMap, point: Point, labels: Labels, value: Value | str) -> Iterator[Sample]:
+    if isinstance(value, str):
+        yield (*labels, value), 1.0
+    elif point.enumeration is not None:
         names = {entry.number: entry.name for entry in device_map.enumerations[point.enumeration]}
         names.setdefault(int(value), f"value_{int(value)}")
         for number, name in names.items():

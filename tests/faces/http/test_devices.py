@@ -8,6 +8,7 @@ import pytest
 
 from gateway.core.site import Site
 from gateway.core.snapshot import DeviceState, Snapshot
+from gateway.devices.model import Kind
 from gateway.devices.schema import load_map, models
 from gateway.errors import MapError
 from gateway.faces.http.devices import CONDITIONS, DEVICE_METRICS, DeviceMetrics, point_metric
@@ -145,7 +146,12 @@ def test_every_metric_of_every_model_is_collected_once(model: str, clock: Manual
     device_map = load_map(model)
     line = UnreadableLine("shelter-a")
     device = make_device("one", 1, line, device_map)
-    device.snapshot = replace(online(clock.now), values={point.name: 1 for point in device_map.points})
+    texts = {point.name: "a" for point in device_map.points if point.kind is Kind.TEXT}
+    device.snapshot = replace(
+        online(clock.now),
+        values={point.name: 1 for point in device_map.points if point.kind is not Kind.TEXT},
+        texts=texts,
+    )
     found = samples(Exposition(Site.of("ridge-07", [line], [device]), clock, Counts()))
     wanted = {info.name for info in map(point_metric, device_map.points) if info is not None}
     assert {name for name, _, _ in found} == wanted | {info.name for info in DEVICE_METRICS}

@@ -17,6 +17,7 @@ from prometheus_client.openmetrics.exposition import generate_latest as generate
 from gateway.core.site import Site
 from gateway.core.snapshot import DeviceState, Snapshot
 from gateway.core.stats import DeviceHistoryStats, HistoryStats, ModbusServerStats
+from gateway.devices.model import Kind
 from gateway.devices.schema import load_map, models
 from gateway.faces.http.exposition import DEVICES_A_TURN, PIECE_BYTES, Exposition, compressed
 from gateway.faces.http.own import Counts, HttpStats
@@ -79,7 +80,9 @@ def busy_site(clock: ManualClock, model: str) -> Site:
             values={
                 point.name: value if point.unit and point.metric_type == "gauge" else abs(int(value))
                 for point in device_map.points
+                if point.kind is not Kind.TEXT
             },
+            texts={point.name: f'"{value}"\\' for point in device_map.points if point.kind is Kind.TEXT},
             warnings=frozenset({"identity_mismatch", "history_late"}) if value == 3 else frozenset(),
         )
     devices[1].stats.errors["crc"] = 2

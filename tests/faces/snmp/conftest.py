@@ -26,11 +26,11 @@ def device_map() -> DeviceMap:
 
 @pytest.fixture
 def site(device_map: DeviceMap) -> Site:
-    """Two lines, two devices with address 1; 11 and 21 are online, 12 was never heard."""
+    """Two lines, two devices with address 1; 11 and 21 are online, 12, a TriStar, was never heard."""
     lines = (StubLine("shelter-a", 1, "/dev/ttyA"), StubLine("Hütte", 2, "/dev/ttyB", LineState.DOWN))
     devices = [
         Device("array-1", 11, 1, device_map),
-        Device("array-2", 12, 2, device_map),
+        Device("array-2", 12, 2, load_map("tristar-mppt")),
         Device("array-3", 21, 1, device_map),
     ]
     for device, line in zip(devices, (lines[0], lines[0], lines[1]), strict=True):

@@ -12,7 +12,7 @@ from pathlib import Path
 from gateway.core.site import Device, LineState, LineStatus, Outcome, Ticket
 from gateway.core.snapshot import DeviceState, Snapshot
 from gateway.core.stats import LineStats
-from gateway.devices.model import DeviceMap, Identification, Value
+from gateway.devices.model import DeviceMap, Identification, Kind, Value
 from gateway.faces.snmp.agent import SnmpAgent
 
 REPOSITORY = Path(__file__).parents[3]
@@ -57,6 +57,8 @@ def values_of(device_map: DeviceMap, unit_id: int) -> dict[str, Value]:
     """A value for every point that differs by point and device and fits every syntax."""
     values: dict[str, Value] = {}
     for position, point in enumerate(device_map.points):
+        if point.kind is Kind.TEXT:
+            continue
         if point.enumeration is not None:
             numbers = [each.number for each in device_map.enumerations[point.enumeration]]
             values[point.name] = numbers[(position + unit_id) % len(numbers)]
@@ -70,6 +72,11 @@ def values_of(device_map: DeviceMap, unit_id: int) -> dict[str, Value]:
     return values
 
 
+def texts_of(device_map: DeviceMap, unit_id: int) -> dict[str, str]:
+    """A text for every point that is one, likewise."""
+    return {point.name: f"{point.name} of {unit_id}" for point in device_map.points if point.kind is Kind.TEXT}
+
+
 def online(device_map: DeviceMap, unit_id: int, at: float = NOW) -> Snapshot:
     values = values_of(device_map, unit_id)
     return Snapshot(
@@ -78,6 +85,7 @@ def online(device_map: DeviceMap, unit_id: int, at: float = NOW) -> Snapshot:
         state_since=at,
         last_reply_at=at,
         values=values,
+        texts=texts_of(device_map, unit_id),
         read_at=dict.fromkeys(values, at),
         identification=Identification("Morningstar Corp.", "PS-MPPT-40M", "v01.02.13"),
         serial_number="16250001",

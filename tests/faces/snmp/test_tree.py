@@ -103,7 +103,7 @@ def test_a_point_that_a_device_shows_for_the_first_time_appears(
     device = site.by_unit[12]
     device.snapshot = Snapshot(state=DeviceState.ONLINE, values={"battery_voltage": 12.0})
     first = [oid for oid in walk(agent, clock.now) if oid[-1] == 12]
-    device.snapshot = online(device_map, 12)
+    device.snapshot = online(device.map, 12)
     later = [oid for oid in walk(agent, clock.now) if oid[-1] == 12]
     assert (*LIVE, BATTERY_VOLTAGE, 12) in first
     assert set(first) < set(later)
