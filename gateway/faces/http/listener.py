@@ -3,7 +3,7 @@
 Rules: a connection that sends no whole request header, or no further request, within `idle_timeout_s` is
 closed. At most `max_connections` are kept: when one more comes, the one that has been open longest and has
 nothing left to send makes room, so that idle strangers cannot keep a scraper out. With TLS a connection counts
-from the end of its handshake, which has `idle_timeout_s` too.
+from the end of its handshake; as many more may be shaking hands (handshakes.py), each for `idle_timeout_s` at most.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from aiohttp import web
 
 from gateway.errors import ListenError
 from gateway.faces.http.access import load_certificate, tls_context
+from gateway.faces.http.handshakes import Handshakes
 from gateway.faces.http.own import HttpStats
 from gateway.faces.http.settings import HttpSettings
 
@@ -43,6 +44,7 @@ class HttpListener:
         self._stats = stats
         self._runner: web.AppRunner | None = None
         self._server: asyncio.Server | None = None
+        self._handshakes: Handshakes | None = None  # with TLS, instead of a server
         self._tls: ssl.SSLContext | None = None
         self.key = (host, port, bool(settings.tls_certificate))
         """Two listeners that agree in this are the same."""
@@ -51,6 +53,8 @@ class HttpListener:
     @property
     def bound(self) -> tuple[str, int] | None:
         """Address and port really listened on; None while stopped."""
+        if self._handshakes is not None:
+            return self._handshakes.bound
         if self._server is None or not self._server.sockets:
             return None
         host, port, *_ = self._server.sockets[0].getsockname()
@@ -58,7 +62,7 @@ class HttpListener:
 
     async def start(self) -> None:
         """Listen; ListenError names the address and why it cannot."""
-        if self._server is not None:
+        if self._server is not None or self._handshakes is not None:
             return
         try:
             application, tls = self._application(), tls_context(self._settings)
@@ -75,14 +79,12 @@ class HttpListener:
         await runner.setup()
         self._runner = runner
         try:
-            loop = asyncio.get_running_loop()
-            self._server = await loop.create_server(
-                self._accept,
-                self._host,
-                self._port,
-                ssl=tls,
-                ssl_handshake_timeout=None if tls is None else self._settings.idle_timeout_s,
-            )
+            if tls is None:
+                loop = asyncio.get_running_loop()
+                self._server = await loop.create_server(self._accept, self._host, self._port)
+            else:
+                self._handshakes = self._way_in(tls)
+                self._handshakes.open(self._host, self._port)
         except OSError as error:
             await self.stop()
             reason = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror
@@ -94,6 +96,8 @@ class HttpListener:
     def adjust(self, settings: HttpSettings) -> None:
         """Go on by other settings, with what the certificate files hold now; ListenError when they are of no use."""
         self._settings = settings
+        if self._handshakes is not None:
+            self._handshakes.most, self._handshakes.timeout_s = settings.max_connections, settings.idle_timeout_s
         if self._tls is not None:
             load_certificate(self._tls, settings)
 
@@ -106,10 +110,25 @@ class HttpListener:
             self._recount = None
         if server is not None:
             server.close()
+        handshakes, self._handshakes = self._handshakes, None
+        if handshakes is not None:
+            await handshakes.close()
         if runner is not None:
             await runner.cleanup()
         if server is not None:
             await server.wait_closed()
+
+    def _way_in(self, tls: ssl.SSLContext) -> Handshakes:
+        assert self._runner is not None
+        assert self._runner.server is not None
+        return Handshakes(
+            tls,
+            self._stats,
+            most=self._settings.max_connections,
+            timeout_s=self._settings.idle_timeout_s,
+            protocol=self._runner.server,
+            entered=lambda: self._make_room(self._settings.max_connections),
+        )
 
     def _accept(self) -> asyncio.Protocol:
         assert self._runner is not None

@@ -1,0 +1,70 @@
+"""The way in by TLS: who never finishes a handshake is one of few, ends soon, and keeps nobody out."""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from aiohttp import ClientSession, ClientTimeout
+
+from gateway.service.loops import Loop, loop_factory
+
+from .conftest import Gateway
+from .test_access import certificate
+from .test_listener import still_open, strangers
+
+MakeGateway = Callable[..., Gateway]
+
+
+@pytest.mark.parametrize("choice", [Loop.ASYNCIO, Loop.UVLOOP])
+def test_strangers_who_never_shake_hands_are_few_and_keep_nobody_out(
+    make_gateway: MakeGateway, tmp_path: Path, choice: Loop
+) -> None:  # F67
+    if choice is Loop.UVLOOP:
+        pytest.importorskip("uvloop")
+    with asyncio.Runner(loop_factory=loop_factory(choice)) as runner:
+        runner.run(_besieged(make_gateway, tmp_path))
+
+
+async def _besieged(make_gateway: MakeGateway, tmp_path: Path) -> None:
+    crt, key = certificate(tmp_path)
+    trusting = ssl.create_default_context(cafile=crt)
+    trusting.check_hostname = False
+    gateway = make_gateway(tls_certificate=crt, tls_private_key=key, max_connections=16)
+    hello = bytes.fromhex("16 0301 0200 01 0001fc 0303")  # the beginning of a ClientHello of 512 bytes
+    async with gateway.running(), strangers(gateway, 250) as silent, strangers(gateway, 250, hello) as begun:
+        url = gateway.url.replace("http:", "https:")
+        async with ClientSession(timeout=ClientTimeout(total=5)) as session:
+            async with session.get(f"{url}/metrics", ssl=trusting) as reply:
+                assert reply.status == 200
+            kept = await asyncio.gather(*(still_open(streams) for streams in (*silent, *begun)))
+            assert 0 < sum(kept) <= 16
+            assert gateway.face.stats.closed_for_room >= 500 - 16
+            async with session.get(f"{url}/healthz", ssl=trusting) as reply:
+                assert reply.status == 200, "a connection that came in stays while others shake hands"
+
+
+async def test_a_handshake_that_does_not_go_on_ends(make_gateway: MakeGateway, tmp_path: Path) -> None:  # F67
+    crt, key = certificate(tmp_path)
+    gateway = make_gateway(tls_certificate=crt, tls_private_key=key, idle_timeout_s=0.05)
+    async with gateway.running():
+        async with strangers(gateway, 1) as [(reader, _)], asyncio.timeout(5):
+            await reader.read()
+        async with strangers(gateway, 1, b"GET /metrics HTTP/1.1\r\n\r\n") as [(reader, _)], asyncio.timeout(5):
+            await reader.read()  # that is no TLS
+
+
+async def test_stopping_ends_handshakes(make_gateway: MakeGateway, tmp_path: Path) -> None:
+    crt, key = certificate(tmp_path)
+    gateway = make_gateway(tls_certificate=crt, tls_private_key=key, idle_timeout_s=60.0)
+    async with gateway.running(), strangers(gateway, 3) as opened:
+        async with asyncio.timeout(5):
+            while gateway.face.stats.connections < 3:  # noqa: ASYNC110 - a counter sets no event
+                await asyncio.sleep(0.001)
+        for listener in gateway.face.listeners:
+            await listener.stop()
+        assert [await still_open(streams) for streams in opened] == [False] * 3
+        assert gateway.face.listeners[0].bound is None
