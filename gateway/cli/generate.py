@@ -9,6 +9,7 @@ import typer
 
 from gateway.errors import MapError
 from gateway.generate import outputs
+from gateway.service.keys import parse_root
 
 
 def command(
@@ -18,16 +19,26 @@ def command(
     root: Annotated[
         Path, typer.Option(exists=True, file_okay=False, help="The source tree with its docs and mibs.")
     ] = Path(),
+    enterprise_root: Annotated[
+        str,
+        typer.Option(
+            help="Your snmp.enterprise_root: make only the MIB and the files for an NMS, with it, below --root.",
+        ),
+    ] = "",
 ) -> None:
-    """Make the MIB, the metric list and the register pages from the device maps."""
+    """Make the MIB, the metric list, the register pages and the files under deploy/ from the device maps."""
     try:
-        paths = outputs.check(root) if check else outputs.write(root)
+        made = outputs.own_outputs(parse_root(enterprise_root)) if enterprise_root else None
+    except ValueError as error:
+        raise typer.BadParameter(f"{enterprise_root!r}: {error}", param_hint="--enterprise-root") from None
+    try:
+        paths = outputs.check(root, made) if check else outputs.write(root, made)
     except MapError as error:
         typer.echo(str(error), err=True)
         raise typer.Exit(1) from None
     verb = "differs" if check else "written"
     for path in paths:
-        print(f"{verb} {path}")
+        print(f"{verb} {root / path if enterprise_root else path}")
     if check and paths:
         typer.echo("Derived files are not what the maps say: run `prostar-gateway generate` and commit.", err=True)
         raise typer.Exit(1)

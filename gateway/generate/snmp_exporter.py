@@ -30,6 +30,9 @@ _AS_LABELS = {"pgwDeviceName", "pgwDeviceModel", "pgwDeviceLine", "pgwLineName",
 _CHATTER = {"pgwLineError", "pgwLineTopClient"}
 """Texts that would make a new series whenever they change."""
 
+_SCRAPED = (RowKind.LINE, RowKind.DEVICE, RowKind.CONDITION)
+"""Days of the log and the like are no series."""
+
 _UNIT_WORDS = {"h": "hours", "d": "days"}
 _HUNDREDTHS = "hundredths of a second"
 
@@ -80,7 +83,7 @@ def metric_of(point: Point) -> tuple[str, int | None]:
 
 def _modules(described: Layout, maps: Sequence[DeviceMap]) -> dict[str, dict[str, Node]]:
     settings = {table.name: table for table in described.tables}[_SETTINGS_TABLE]
-    tables = [table for table in described.tables if table is not settings]
+    tables = [table for table in described.tables if table is not settings and table.rows in _SCRAPED]
     names = _Names(described, maps)
     return {
         MODULE: _module(

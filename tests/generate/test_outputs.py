@@ -93,3 +93,24 @@ def test_command_says_which_map_is_wrong(tree: Path, monkeypatch: pytest.MonkeyP
 def test_command_refuses_a_root_that_is_not_there(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["--root", str(tmp_path / "none")])
     assert result.exit_code == 2
+
+
+def test_an_operators_own_root_is_in_every_file_that_names_one(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["--enterprise-root", "1.3.6.1.4.1.99999.7", "--root", str(tmp_path)])
+    assert result.exit_code == 0
+    written = {str(path.relative_to(tmp_path)): path.read_text(encoding="utf-8") for path in tmp_path.rglob("*.*")}
+    assert {path for path in outputs.outputs() if path.startswith(("deploy/nms/", "mibs/"))} - written.keys() == {
+        "mibs/oids.lock"
+    }
+    assert all(path.startswith(("deploy/nms/", "mibs/")) for path in written)
+    assert [path for path, text in written.items() if "32473" in text] == []
+    assert [path for path, text in written.items() if path.startswith("deploy") and ".99999.7" not in text] == []
+    again = CliRunner().invoke(app, ["--enterprise-root", "1.3.6.1.4.1.99999.7", "--check", "--root", str(tmp_path)])
+    assert (again.exit_code, again.stdout) == (0, "")
+
+
+@pytest.mark.parametrize("wrong", ["1.3.6.1.2.1", "99999", "1.3.6.1.4.1.33333.1", "1.3.6.1.4.1"])
+def test_a_root_that_is_not_the_operators_is_refused(tmp_path: Path, wrong: str) -> None:
+    result = CliRunner().invoke(app, ["--enterprise-root", wrong, "--root", str(tmp_path)])
+    assert result.exit_code == 2
+    assert list(tmp_path.iterdir()) == []
