@@ -96,6 +96,13 @@ class NotifyStats:
 
 
 @dataclass(slots=True)
+class LogStats:
+    """The log since start."""
+
+    dropped: int = 0  # lines that could not be written in time
+
+
+@dataclass(slots=True)
 class ServiceStats:
     """The process since start."""
 
@@ -103,6 +110,7 @@ class ServiceStats:
     reload_works: bool = True  # whether the file was right when it was last read
     configured_at: float = 0.0  # wall time at which the configuration in use was taken
     restarts: Counter[str] = field(default_factory=Counter)  # task → how often a bug ended it
+    log: LogStats = field(default_factory=LogStats)
 
 
 @dataclass(slots=True)

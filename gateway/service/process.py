@@ -22,6 +22,7 @@ from gateway.service.advice import advice
 from gateway.service.config import Config
 from gateway.service.garbage import set_aside
 from gateway.service.gateway import Gateway
+from gateway.service.logs import Log
 from gateway.service.reload import Reloader
 from gateway.service.settings import line_budgets
 from gateway.service.systemd import Systemd
@@ -32,13 +33,13 @@ EX_SOFTWARE = 70
 _log = logging.getLogger(__name__)
 
 
-def serve(path: Path, config: Config, make_loop: Callable[[], asyncio.AbstractEventLoop]) -> int:
+def serve(path: Path, config: Config, make_loop: Callable[[], asyncio.AbstractEventLoop], log: Log) -> int:
     """Run the gateway until a signal stops it; the exit status. `config` is what the file at `path` held."""
     with asyncio.Runner(loop_factory=make_loop) as runner:
-        return runner.run(_serve(path, config))
+        return runner.run(_serve(path, config, log))
 
 
-async def _serve(path: Path, config: Config) -> int:
+async def _serve(path: Path, config: Config, log: Log) -> int:
     running = asyncio.get_running_loop()
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -46,7 +47,8 @@ async def _serve(path: Path, config: Config) -> int:
     systemd = Systemd(os.environ)
     clock = SystemClock()
     gateway = Gateway(config, clock, systemd)
-    reloader = Reloader(path, gateway, clock, systemd)
+    gateway.stats.log = log.stats
+    reloader = Reloader(path, gateway, clock, systemd, log)
     gateway.keep(reloader)
     running.add_signal_handler(signal.SIGHUP, reloader.wanted)
     for text in advice(config, line_budgets(config)):

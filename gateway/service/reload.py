@@ -24,6 +24,7 @@ from gateway.service.changes import NEEDS_RESTART, changes
 from gateway.service.config import load_config
 from gateway.service.garbage import set_aside
 from gateway.service.gateway import Gateway
+from gateway.service.logs import Log
 from gateway.service.systemd import Systemd
 
 SHOWN = 32
@@ -37,11 +38,12 @@ class Reloader:
 
     name = "reload"
 
-    def __init__(self, path: Path, gateway: Gateway, clock: Clock, systemd: Systemd) -> None:
+    def __init__(self, path: Path, gateway: Gateway, clock: Clock, systemd: Systemd, log: Log) -> None:
         self._path = path
         self._gateway = gateway
         self._clock = clock
         self._systemd = systemd
+        self._log = log
         self._stats: ServiceStats = gateway.stats
         self._asked = asyncio.Event()
 
@@ -78,6 +80,7 @@ class Reloader:
         except Exception:
             gateway.supervisor.give_up(self.name)  # half of it may be done: only a new start is sure
             raise
+        self._log.use(config.log.level, config.log.form)
         self._stats.reloads["applied"] += 1
         self._stats.configured_at = self._clock.wall()
         self._stats.reload_works = True

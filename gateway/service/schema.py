@@ -386,6 +386,19 @@ class HistoryTable(Table):
     ] = Field(default=24.0, ge=1.0, le=720.0)
 
 
+class LogTable(Table):
+    """`[log]`: what is logged, and how it looks."""
+
+    level: Annotated[
+        Literal["debug", "info", "warning", "error"],
+        Key('"debug", "info", "warning" or "error"', "From which level on events are logged; --log-level goes before."),
+    ] = "info"
+    form: Annotated[
+        Literal["text", "json"],
+        Key('"text" or "json"', "How an event looks: key=value, or a JSON object a line."),
+    ] = "text"
+
+
 class Config(Table):
     """The whole file."""
 
@@ -404,3 +417,4 @@ class Config(Table):
     snmp: Annotated[SnmpTable, Key("an [snmp] table", "The SNMP face.")] = SnmpTable()
     http: Annotated[HttpTable, Key("an [http] table", "The HTTP face.")] = HttpTable()
     history: Annotated[HistoryTable, Key("a [history] table", "The controllers' daily log.")] = HistoryTable()
+    log: Annotated[LogTable, Key("a [log] table", "The log of the gateway itself.")] = LogTable()

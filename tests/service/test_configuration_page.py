@@ -34,6 +34,7 @@ SECTIONS: dict[str, type[BaseModel]] = {
     "`[[snmp.notify]]`": schema.NotifyTable,
     "`[http]`": schema.HttpTable,
     "`[history]`": schema.HistoryTable,
+    "`[log]`": schema.LogTable,
 }
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import json
 import logging
+import os
 import sys
 from collections.abc import Iterator
 
@@ -11,7 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.service.logs import EventFormatter, Level, set_up_logging
+from gateway.service.log_writer import LogWriter
+from gateway.service.logs import EventFormatter, Form, JsonFormatter, Level, Log, set_up_logging
 
 
 def formatted(message: str, *args: object, name: str = "gateway.x") -> str:
@@ -63,15 +66,58 @@ def test_a_traceback_follows_its_line() -> None:
 
 def test_levels_choose_what_is_written(root: logging.Logger) -> None:
     stream = io.StringIO()
-    set_up_logging(Level.WARNING, stream)
+    set_up_logging(Level.WARNING, Form.TEXT, logging.StreamHandler(stream))
     logging.getLogger("gateway.x").info("event=no")
     logging.getLogger("gateway.x").warning("event=yes")
     assert [line.split()[-1] for line in stream.getvalue().splitlines()] == ["event=yes"]
 
 
-def test_a_log_that_cannot_be_written_disturbs_nobody(root: logging.Logger, capsys: pytest.CaptureFixture[str]) -> None:
-    stream = io.StringIO()
-    set_up_logging(Level.INFO, stream)
-    stream.close()
-    logging.getLogger("gateway.x").warning("event=lost")
-    assert capsys.readouterr().err == ""
+def as_json(message: str, *args: object) -> dict[str, object]:
+    record = logging.LogRecord("gateway.x", logging.WARNING, "", 0, message, args, None)
+    (line,) = JsonFormatter().format(record).splitlines()
+    found = json.loads(line)
+    assert list(found)[:3] == ["time", "level", "event"]
+    assert isinstance(found, dict)
+    return {key: value for key, value in found.items() if key not in {"time", "level"}}
+
+
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        ("event=line_down line=a", {"event": "line_down", "line": "a"}),
+        ("event=x n=3 s=0.5 id=007 big=12345678901234567890 word=0x12",
+         {"event": "x", "n": 3, "s": 0.5, "id": "007", "big": "12345678901234567890", "word": "0x12"}),
+        ('event=x error="it said \\"no\\"" tries=2', {"event": "x", "error": 'it said "no"', "tries": 2}),
+        ('event=x path="C:\\x" n=1', {"event": "x", "path": "C:\\x", "n": 1}),
+        ("event=x empty= n=1", {"event": "x", "empty": "", "n": 1}),
+        ("no event at all", {"event": "log", "logger": "gateway.x", "message": "no event at all"}),
+    ],
+)  # fmt: skip
+def test_json_has_the_keys_of_the_event(message: str, expected: dict[str, object]) -> None:
+    assert as_json(message) == expected
+
+
+@given(st.text(max_size=200))
+def test_json_is_one_line_whatever_is_in_it(text: str) -> None:
+    assert as_json('event=x peer="%s" n=1', text)["event"] == "x"
+    assert as_json("%s", f"!{text}")["event"] == "log"
+
+
+def test_json_has_the_traceback_in_its_line() -> None:
+    record = logging.LogRecord("g", logging.ERROR, "", 0, "event=task_failed", (), None)
+    try:
+        _ = 1 / int("0")
+    except ZeroDivisionError:
+        record.exc_info = sys.exc_info()
+    (line,) = JsonFormatter().format(record).splitlines()
+    assert "ZeroDivisionError" in json.loads(line)["traceback"]
+
+
+def test_the_level_of_the_command_line_goes_before_the_files(root: logging.Logger) -> None:
+    writer = LogWriter(os.open(os.devnull, os.O_WRONLY), journal=False)
+    found = []
+    for log, level, form in ((Log(writer, None), "warning", "json"), (Log(writer, Level.ERROR), "debug", "text")):
+        log.use(level, form)
+        found.append((root.level, type(writer.formatter)))
+    assert found == [(logging.WARNING, JsonFormatter), (logging.ERROR, EventFormatter)]
+    writer.close()

@@ -15,6 +15,7 @@ from gateway.errors import ConfigError
 from gateway.faces.snmp.agent import SnmpAgent
 from gateway.service.config import Config, parse_config
 from gateway.service.gateway import Gateway
+from gateway.service.logs import Log
 from gateway.service.reload import Reloader
 from gateway.service.systemd import Systemd
 
@@ -31,6 +32,16 @@ model = "prostar-mppt"
 A, B = LINE.format(name="a", unit=11), LINE.format(name="b", unit=12)
 FACES = '[modbus]\nlisten = ["127.0.0.1:0"]\n[http]\nlisten = ["127.0.0.1:0"]\n'
 COMMUNITY = '[snmp]\nlisten = ["127.0.0.1:0"]\n[[snmp.community]]\nname = "public"\nsource = ["127.0.0.0/8"]\n'
+
+
+class Untouched(Log):
+    """The log of the test runner goes on as it is."""
+
+    def __init__(self) -> None:
+        """Have no writer."""
+
+    def use(self, level: str, form: str) -> None:
+        """See `Log.use`."""
 
 
 class Site:
@@ -153,7 +164,7 @@ async def test_a_mistake_in_the_middle_of_a_change_ends_the_process_for_a_new_st
     path = site.folder / "site.toml"
     path.write_text(site.text(A, FACES))
     gateway = Gateway(site.config(A, FACES), SystemClock())
-    reloader = Reloader(path, gateway, SystemClock(), Systemd({}))
+    reloader = Reloader(path, gateway, SystemClock(), Systemd({}), Untouched())
     gateway.keep(reloader)
 
     def fail(*_: object) -> None:
@@ -171,7 +182,7 @@ async def test_what_a_reload_made_is_set_aside_from_the_collector(site: Site) ->
     path.write_text(site.text(A, B, FACES))
     async with running(site.config(A, FACES)) as gateway:
         gc.unfreeze()
-        await Reloader(path, gateway, SystemClock(), Systemd({}))._reload(0.0)
+        await Reloader(path, gateway, SystemClock(), Systemd({}), Untouched())._reload(0.0)
         assert list(gateway.site.by_unit) == [11, 12]
         assert gc.get_freeze_count() > 10_000
         gc.unfreeze()

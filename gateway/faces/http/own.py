@@ -84,6 +84,10 @@ SERVICE_RULES: tuple[Rule[ServiceStats], ...] = (
         gateway_counter("task_restarts", "Times that a task died of a bug and was started again.", "task"),
         lambda stats: stats.restarts,
     ),
+    one(
+        gateway_counter("log_lines_dropped", "Lines of the log that nobody took in time."),
+        lambda stats: stats.log.dropped,
+    ),
 )
 
 MODBUS_RULES: tuple[Rule[ModbusServerStats], ...] = (

@@ -147,6 +147,7 @@ class ModbusServer:
         self._listening: set[Listener] = set()
         self._sweep: asyncio.TimerHandle | None = None
         self._refusals_told = LogBudget()
+        self._ends_told = LogBudget()
         self._shared = self._share(settings, site)
         self.dispatcher = Dispatcher({}, clock, self._shared)
         self._of_line: dict[str, Dispatcher] = {}
@@ -281,7 +282,10 @@ class ModbusServer:
             connection.client.last_seen = max(connection.client.last_seen, connection.seen)
             reason = connection.overdue(now)
             if reason is not None:
-                logger.info("event=connection_ended peer=%s reason=%s", connection.peer, reason)
+                left_out = self._ends_told.spend((reason, connection.peer), now)
+                if left_out is not None:
+                    text = "event=connection_ended peer=%s reason=%s left_out=%d"
+                    logger.info(text, connection.peer, reason, left_out)
                 connection.end(reason)
 
     def _sweep_again(self) -> None:

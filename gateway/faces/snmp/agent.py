@@ -183,7 +183,9 @@ class SnmpAgent:
             return refused.report or None
         except Exception:  # noqa: BLE001 - the datagram edge: whatever one datagram does, the next one is served
             self.counters.internal_errors += 1
-            _log.exception("event=snmp_internal_error source=%s", host)
+            count = self._throttle.due("internal_error", now)
+            if count:
+                _log.exception("event=snmp_internal_error source=%s count=%d", host, count)
         return None
 
     def answer_waiting(self, sock: socket.socket, context: bytes = b"") -> None:

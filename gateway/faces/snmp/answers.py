@@ -26,6 +26,9 @@ from gateway.faces.snmp.tree import Window
 
 _log = logging.getLogger(__name__)
 
+TOLD = 1000
+"""Of so many answers that failed for a mistake of ours, one is logged: a datagram is quickly sent."""
+
 MOST_ANSWERS = 4096
 MOST_OCTETS = 4 << 20
 _OBJECT_OCTETS = 500
@@ -125,7 +128,8 @@ class Answer:
             raise
         except Exception:  # noqa: BLE001 - the datagram edge: a defect of ours must not cost the asker its reply
             counters.internal_errors += 1
-            _log.exception("event=snmp_internal_error")
+            if counters.internal_errors % TOLD == 1:
+                _log.exception("event=snmp_internal_error count=%d", counters.internal_errors)
             status, index, varbinds = ErrorStatus.GEN_ERR, 0, b""
         if varbinds is None or len(varbinds) > room:
             status, index, varbinds = ErrorStatus.TOO_BIG, 0, b""
