@@ -13,6 +13,7 @@ That converter is an agent of one controller: flat scalars `root.N.0`, whose num
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from gateway.core.site import Device
@@ -130,9 +131,9 @@ def _value(point: Point, described: Emc1Object) -> ObjectType:
     elif described.form is Emc1Form.BITS:
         of_snapshot = _shown_as(point, lambda value: bit_octets(int(value)))
     elif described.form is Emc1Form.UNSIGNED:
-        of_snapshot = _shown_as(point, lambda value: _within(Syntax.UNSIGNED32, round(value * scale)))
+        of_snapshot = _shown_as(point, lambda value: _within(Syntax.UNSIGNED32, value * scale))
     else:
-        of_snapshot = _shown_as(point, lambda value: _within(Syntax.INTEGER32, int(value)))
+        of_snapshot = _shown_as(point, lambda value: _within(Syntax.INTEGER32, value))
 
     def get(row: DeviceRow, _now: float) -> CellValue:
         return of_snapshot(row.device.snapshot)
@@ -159,5 +160,6 @@ def _shown_as(point: Point, form: Callable[[Value], CellValue]) -> Callable[[Sna
     return of
 
 
-def _within(syntax: Syntax, number: int) -> int | None:
-    return number if in_range(syntax, number) else None
+def _within(syntax: Syntax, value: float) -> int | None:
+    number = round(value) if math.isfinite(value) else None
+    return number if number is not None and in_range(syntax, number) else None

@@ -265,9 +265,9 @@ def _value(row: EntityRow) -> CellValue:
     point = _point(row)
     assert point.mib is not None
     value = _device(row).snapshot.shown().get(point.name)
-    if value is None or not math.isfinite(value):
+    if value is None or not math.isfinite(scaled := value * point.mib.scale):
         return None
-    number = round(value * point.mib.scale)
+    number = round(scaled)
     return number if abs(number) <= VALUE_LIMIT else None
 
 

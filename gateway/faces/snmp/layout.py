@@ -335,9 +335,9 @@ def _labels(known: Mapping[int, tuple[str, str]], syntax: Syntax) -> tuple[tuple
 def _number_getter(point: str, scale: int, syntax: Syntax) -> Callable[[DeviceRow, float], CellValue]:
     def get(row: DeviceRow, _now: float) -> CellValue:
         value = row.device.snapshot.shown().get(point)
-        if value is None or not math.isfinite(value):
+        if value is None or not math.isfinite(scaled := value * scale):
             return None
-        number = round(value * scale)
+        number = round(scaled)
         return number if in_range(syntax, number) else None
 
     return get

@@ -5,14 +5,15 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Callable
+from typing import cast
 
 import pytest
 from pysnmp.proto.api import v2c
 
 from gateway.errors import ListenError
-from gateway.faces.snmp.agent import SnmpAgent
-from tests.faces.snmp.stub_site import listening
-from tests.faces.snmp.test_responder import SYS_DESCR, Reply, request
+from gateway.faces.snmp.agent import KNOWN_A_LOOK, TURN_S, SnmpAgent
+from tests.faces.snmp.stub_site import StubClock, listening
+from tests.faces.snmp.test_responder import LOCAL, SYS_DESCR, Reply, request
 
 
 async def exchange(address: tuple[str, int], data: bytes) -> bytes:
@@ -100,3 +101,35 @@ async def test_an_asker_that_is_gone_does_not_stop_the_server(make_agent: Callab
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
                 gone.sendto(request(v2c.GetRequestPDU, SYS_DESCR), bound)
         assert Reply(await exchange(bound, request(v2c.GetRequestPDU, SYS_DESCR))).status == 0
+
+
+class Flood:
+    """A socket in which there is always one more datagram, each 0.1 ms after the other."""
+
+    def __init__(self, clock: StubClock, data: bytes) -> None:
+        self._clock = clock
+        self._data = data
+        self.taken = 0
+        self.sent = 0
+
+    def recvfrom(self, _size: int) -> tuple[bytes, tuple[str, int]]:
+        self._clock.now += 0.0001
+        self.taken += 1
+        return self._data, (LOCAL, 4711)
+
+    def sendto(self, _data: bytes, _address: object) -> None:
+        self.sent += 1
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_flood_gets_a_turn_and_no_more(
+    make_agent: Callable[..., SnmpAgent], clock: StubClock, *, known: bool
+) -> None:
+    """Others of the event loop have their turn after a millisecond, however many datagrams wait."""
+    agent = make_agent(requests_per_s=1e9)
+    name = SYS_DESCR if known else (1, 3)
+    flood = Flood(clock, request(v2c.GetRequestPDU, name))
+    agent.answer_waiting(cast("socket.socket", flood))
+    at_once = round(TURN_S / 0.0001)
+    assert at_once <= flood.taken == flood.sent <= at_once + KNOWN_A_LOOK + 1
+    assert agent.counters.in_packets == agent.counters.responses == flood.taken
