@@ -30,10 +30,17 @@ def command(config: ConfigOption) -> None:
     console.print(_lines(checked, budgets), _devices(checked, budgets), sep="\n")
     modbus = f"Modbus TCP {_at(checked.modbus.listen)}{_tls(checked)}"
     console.print(f"Faces  {modbus} · SNMP {_snmp(checked)} · HTTP {_at(checked.http.listen)}")
+    if snmp_on(checked) and checked.snmp.emc1:
+        console.print(f"EMC-1  {_emc1(checked)}")
     console.print(f"Writes {_writes(checked)}")
     for text in advice(checked, budgets):
         console.print(f"[yellow]warning[/] {escape(text)}", soft_wrap=True)
     console.print(f"[green]{escape(str(config))} is right.[/]", soft_wrap=True)
+
+
+def _emc1(config: Config) -> str:
+    """Which controllers are shown so, and where by default."""
+    return " · ".join(f"unit {each.unit_id}" + f" {_at(each.listen)}" * bool(each.listen) for each in config.snmp.emc1)
 
 
 def _writes(config: Config) -> str:

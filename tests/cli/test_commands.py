@@ -53,6 +53,7 @@ def test_check_config_shows_what_the_lines_can_do() -> None:
     assert list(by_unit) == ["11", "12", "13"]
     assert by_unit["13"] == ["13", "array-3", "shelter-b", "1", "prostar-mppt", "1.0", "s", "300", "s"]
     assert "Modbus TCP 127.0.0.1:1502 · SNMP 127.0.0.1:1161 · HTTP 127.0.0.1:9850" in shown
+    assert "EMC-1  unit 11 127.0.0.1:1162\n" in shown
     assert "warning snmp.enterprise_root: 32473" in shown
     assert shown.endswith("full.toml is right.\n")
     assert "k7-ridge-reader" not in shown

@@ -17,8 +17,9 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from pymodbus.client import ModbusTcpClient
 
-from gateway.devices.model import DeviceMap, Group, Point, Space, WordOrder
+from gateway.devices.model import DeviceMap, Emc1Form, Group, Point, Space, WordOrder
 from gateway.devices.schema import load_map
+from gateway.faces.snmp.entity import sensors
 from tests.e2e.programs import DEMO_DEVICES, REPOSITORY, Launch, Running, Start, environment, wait_until
 
 STILL = ("--speed", "0.001", "--start-hour", "11")
@@ -36,7 +37,7 @@ Values = Mapping[tuple[int, str], float | frozenset[int]]
 @pytest.fixture
 def site(launch: Launch) -> Running:
     """A gateway over the demo's controllers, all of whose points have been read."""
-    running = launch(simulate=STILL)
+    running = launch(simulate=STILL, rest="".join(f"[[snmp.emc1]]\nunit_id = {unit}\n" for unit in UNITS))
     running.wait_online()
     # Settings are read last of all at start.
     wait_until(lambda: running.get("/metrics")[1].count("morningstar_absorption_voltage_volts{") == 3, "the settings")
@@ -137,6 +138,54 @@ def by_snmp(peer: Callable[[str], str], site: Running) -> Values:
     return found
 
 
+def by_entity_sensor(peer: Callable[[str], str], site: Running) -> Values:
+    """What ENTITY-SENSOR-MIB says, by scale and precision."""
+    shown = snmp(peer, site, "snmpbulkwalk", "-OnqeU", "1.3.6.1.2.1.99")
+    cells = {
+        (int(column), int(index)): value
+        for column, index, value in re.findall(r"^\.[\d.]+\.99\.1\.1\.1\.(\d)\.(\d+) (.*)$", shown, re.MULTILINE)
+    }
+    live = (point for point in MAP.points if point.group is Group.LIVE and point.mib is not None)
+    names = {point.mib.column: point.name for point in live if point.mib is not None}
+    thousandths = {"8": 1000, "9": 1}
+    return {
+        (index // 1000, names[index % 1000]): int(value) / thousandths[cells[2, index]] / 10 ** int(cells[3, index])
+        for (column, index), value in cells.items()
+        if column == 4 and cells[5, index] == "1"
+    }
+
+
+def by_emc1(peer: Callable[[str], str], site: Running) -> Values:
+    """What an EMC-1's client reads of each controller, by community and unit id."""
+    found: dict[tuple[int, str], float | frozenset[int]] = {}
+    points = {point.emc1.number: point for point in MAP.points if point.emc1 is not None}
+    for unit in UNITS:
+        options = ("-v2c", "-c", f"public@{unit}", "-m", "", "-OnqeUx", f"127.0.0.1:{site.snmp}", "1.3.6.1.4.1.33333")
+        command = [peer("snmpwalk"), *options]
+        shown = subprocess.run(command, capture_output=True, text=True, env=environment(), check=True).stdout
+        for number, text in re.findall(r"^\.[\d.]+\.33333\.5\.(\d+)\.0 (.*?) ?$", shown, re.MULTILINE):
+            point = points.get(int(number))
+            if "No more" in text:
+                continue  # it is the last object of all
+            if point is not None and (value := emc1_value(point, text.strip('" '))) is not None:
+                found[unit, point.name] = value
+    return found
+
+
+def emc1_value(point: Point, text: str) -> float | frozenset[int] | None:
+    """A value in one of the forms of an EMC-1; octet strings are shown in hexadecimal."""
+    assert point.emc1 is not None
+    if point.emc1.form is Emc1Form.BITS:
+        octets = bytes.fromhex(text)
+        return frozenset(bit for bit in range(32) if octets[bit // 8] & 0x80 >> bit % 8)
+    if point.emc1.form is Emc1Form.FLOAT:
+        written = bytes.fromhex(text).decode()
+        return None if written == "nan" else float(written)
+    if point.bits is not None:
+        return frozenset(bit for bit in range(16) if int(text) >> bit & 1)
+    return int(text) / (point.mib.scale if point.mib is not None else 1)
+
+
 def differences(one: Values, other: Values) -> list[str]:
     """Where the second says something else than the first, or nothing; half a thousandth is rounding."""
     wrong = []
@@ -163,6 +212,13 @@ def test_the_three_faces_agree_on_every_point(site: Running, peer: Callable[[str
     for values, shown in ((in_metrics, http), (in_mib, walked)):
         assert differences(values, shown) == []
         assert differences(shown, values) == []
+    measured = {point.name for point in sensors(MAP)}
+    in_sensors = {key: value for key, value in expected.items() if key[1] in measured}
+    in_emc1 = {key: value for key, value in expected.items() if MAP.point(key[1]).emc1 is not None}
+    for values, shown in ((in_sensors, by_entity_sensor(peer, site)), (in_emc1, by_emc1(peer, site))):
+        assert len(values) > 3 * 20
+        assert differences(values, shown) == []
+        assert differences(shown, values) == []
 
 
 @pytest.mark.peer
@@ -172,6 +228,9 @@ def test_net_snmp_shows_every_table(site: Running, peer: Callable[[str], str]) -
     assert len(names) >= 6
     for name in names:
         shown = snmp(peer, site, "snmptable", "-Ci", name).splitlines()
+        if name == "pgwConditionTable":  # a row for each condition of each controller
+            assert len(shown) > 3 * 40
+            continue
         rows = 2 if name == "pgwLineTable" else 3
         assert shown[0] == f"SNMP table: PROSTAR-GATEWAY-MIB::{name}"
         assert len([row for row in shown[3:] if row.strip()]) == rows, name
