@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from gateway.cli import backup, check_config, clients, demo, generate, log, run, scan, simulate, writes
+from gateway.cli import backup, check_config, clients, demo, generate, log, record, run, scan, simulate, writes
 
 app = typer.Typer(
     help="Modbus TCP, SNMP and Prometheus for Morningstar ProStar MPPT controllers on serial lines.",
@@ -24,6 +24,9 @@ app.command("clients")(clients.command)
 app.command("writes")(writes.command)
 app.command("generate")(generate.command)
 app.command("log")(log.command)
+app.command("record")(record.record_command)
+app.command("trace")(record.trace_command)
+app.command("replay")(record.replay_command)
 app.command("backup")(backup.backup_command)
 app.command("restore")(backup.restore_command)
 

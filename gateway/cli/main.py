@@ -10,7 +10,7 @@ import signal
 import sys
 from types import FrameType
 
-UNTIL_STOPPED = ("run", "demo", "simulate")
+UNTIL_STOPPED = ("run", "demo", "simulate", "replay")
 """Commands that run until a signal ends them; for the others a signal is an interruption."""
 
 

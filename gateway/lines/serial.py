@@ -30,6 +30,7 @@ from gateway.core.site import Device, LineStatus, Outcome, Ticket
 from gateway.core.stats import LineStats
 from gateway.errors import PortError
 from gateway.lines.ports import close_port, open_port
+from gateway.lines.tap import Tap
 from gateway.lines.threads import in_thread
 from gateway.lines.transports import Transport, transport_for
 
@@ -51,6 +52,7 @@ class SerialLine:
         self, settings: LineSettings, devices: Sequence[Device], clock: Clock, rng: Random | None = None
     ) -> None:
         self.settings = settings
+        self.tap = Tap()
         self._clock = clock
         self._rng = rng if rng is not None else Random()  # noqa: S311  # jitter, not secrets
         self._engine = LineEngine(settings, devices, clock.monotonic(), self._rng)
@@ -240,10 +242,14 @@ class SerialLine:
             self._timer = None
         self._acted_at = now = self._clock.monotonic()
         if data:
+            if self.tap:
+                self.tap.tell(now, sent=False, data=data)
             self._engine.receive(data, now)
         self._engine.on_timer(now)
         frame = self._engine.step(now)
         if frame is not None and self._port is not None:
+            if self.tap:
+                self.tap.tell(now, sent=True, data=frame)
             self._port.write(frame)
         deadline = self._engine.next_deadline(now)
         if frame is not None:

@@ -32,6 +32,7 @@ from gateway.service.south import South
 from gateway.service.supervisor import Supervisor
 from gateway.service.systemd import Systemd
 from gateway.service.tls import tls_settings
+from gateway.service.tracing import Tracer
 from gateway.service.watchdog import Watchdog
 
 
@@ -83,9 +84,9 @@ class Gateway:
         )
         self._watching.told = self._tell
         self._harvesting = self._harvester(config, self.site)
-        self._others: tuple[Runnable, ...] = ()
+        self._others: tuple[Runnable, ...] = (Tracer(kept.directory, lambda: self.lines, clock),)
         if systemd is not None and systemd.watchdog_s is not None:
-            self._others = (Watchdog(systemd, systemd.watchdog_s, self.stuck),)
+            self._others += (Watchdog(systemd, systemd.watchdog_s, self.stuck),)
         self.supervisor = Supervisor(clock, south.lines, self.listeners, self.keepers)
         self.stats.restarts = self.supervisor.restarts
 
