@@ -6,12 +6,14 @@ given as the end means the end of that day, so that `since` and `until` with one
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from enum import StrEnum
 from types import MappingProxyType
 from typing import Protocol
+
+from gateway.devices.model import Value
 
 
 class LogFormat(StrEnum):
@@ -43,6 +45,24 @@ class Selection:
     device: str | None = None
     since: float | None = None
     until: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedDay:
+    """A day of one controller; values are in the units of its map's log, times are Unix times."""
+
+    hourmeter: int
+    values: Mapping[str, Value]
+    written_at: float | None  # None: not known
+    error_s: float | None  # by how much that may be wrong, either way
+
+
+class RecentDays(Protocol):
+    """The newest stored days of a device."""
+
+    async def newest(self, line: str, device: str, most: int) -> Sequence[LoggedDay]:
+        """The newest days of the controller last seen there, oldest first; HistoryError when they cannot be read."""
+        ...
 
 
 class DayLog(Protocol):

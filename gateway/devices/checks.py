@@ -323,6 +323,7 @@ def _log(device_map: DeviceMap) -> Iterator[str]:
     if extent is None or extent.poll is not PollClass.BACKGROUND:
         yield f"log: 0x{layout.first:04X}..0x{last:04X} needs an extent of poll class background"
     yield from _doubles([field.name for field in layout.fields], "log: field")
+    yield from _doubles([str(field.column) for field in layout.fields if field.column is not None], "log: column")
     if not any(field.name == HOURMETER and field.words == 2 for field in layout.fields):
         yield f"log: needs a field {HOURMETER} of 2 words to be put in order by"
     yield from (f"log: {problem}" for problem in _log_fields(device_map, layout))
@@ -341,6 +342,8 @@ def _log_fields(device_map: DeviceMap, layout: LogLayout) -> Iterator[str]:
             yield f"{prefix}unknown unit {field.unit!r}"
         if field.bits is not None and field.bits not in device_map.bit_tables:
             yield f"{prefix}unknown bit table {field.bits!r}"
+        if field.name == HOURMETER and field.column is not None:
+            yield f"{prefix}column: it is the index"
         if field.offset + field.words > layout.block_words:
             yield f"{prefix}ends after the block"
         for offset in range(field.offset, field.offset + field.words):

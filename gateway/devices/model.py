@@ -249,6 +249,7 @@ class LogField:
     unit: str
     bits: str | None
     help: str
+    column: int | None = None  # its column in the MIB's log table; numbers are append-only (mibs/oids.lock)
 
 
 @dataclass(frozen=True, slots=True)

@@ -240,6 +240,7 @@ class _LogField(_Form):
     unit: str = ""
     bits: Label | None = None
     help: Text
+    column: Annotated[int, Field(ge=4)] | None = None  # 1 is the hourmeter, 2 and 3 are the date and its error
 
 
 class _Log(_Form):

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from gateway.core.daylog import Selection
+from gateway.core.daylog import LoggedDay, Selection
 from gateway.devices.model import Value
 from gateway.history.database import FILE_NAME, explained, open_for_reading
 
@@ -117,6 +117,18 @@ class HistoryReader:
                             at = last[1] + 1.0
                         last = (owner, at)
                     yield StoredDay(owner, hourmeter, slot, bytes(words), json.loads(fields), harvested, at, error_s)
+
+    def newest(self, line: str, device: str, most: int) -> list[LoggedDay]:
+        """The newest days of the controller that was last seen at a device, oldest first."""
+        with explained(self._path):
+            rows = self._db.execute(
+                "SELECT hourmeter, fields, written_wall, error_s FROM day WHERE controller = "
+                "(SELECT key FROM controller WHERE line = ? AND device = ? ORDER BY look_wall DESC, key DESC LIMIT 1) "
+                "ORDER BY hourmeter DESC LIMIT ?",
+                (line, device, most),
+            )
+            found = [LoggedDay(hours, json.loads(fields), written, error_s) for hours, fields, written, error_s in rows]
+        return found[::-1]
 
     def apart(self, selection: Selection) -> Iterator[StoredApart]:
         """The blocks kept apart of the devices selected; they have no date."""

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Sequence
 from pathlib import Path
 
-from gateway.core.daylog import LogFormat, Selection
+from gateway.core.daylog import LogFormat, LoggedDay, Selection
 from gateway.history.export import export
 from gateway.history.reader import HistoryReader
 
 
 class HistorySource:
-    """Satisfies `core.daylog.DayLog` for the history in one directory."""
+    """Satisfies `core.daylog.DayLog` and `RecentDays` for the history in one directory."""
 
     def __init__(self, directory: Path, site: str) -> None:
         self._directory = directory
@@ -21,6 +21,10 @@ class HistorySource:
     async def devices(self) -> frozenset[str]:
         """See `DayLog.devices`."""
         return await asyncio.to_thread(self._devices)
+
+    async def newest(self, line: str, device: str, most: int) -> Sequence[LoggedDay]:
+        """See `RecentDays.newest`."""
+        return await asyncio.to_thread(self._newest, line, device, most)
 
     async def export(self, form: LogFormat, selection: Selection) -> AsyncGenerator[bytes, None]:
         """See `DayLog.export`."""
@@ -38,6 +42,10 @@ class HistorySource:
             if reading is not None and not reading.done():
                 await asyncio.wait([reading])  # a connection must not be closed under a thread that reads it
             await asyncio.to_thread(reader.close)
+
+    def _newest(self, line: str, device: str, most: int) -> Sequence[LoggedDay]:
+        with HistoryReader(self._directory) as reader:
+            return reader.newest(line, device, most)
 
     def _devices(self) -> frozenset[str]:
         with HistoryReader(self._directory) as reader:

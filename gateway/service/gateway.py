@@ -20,6 +20,8 @@ from gateway.faces.http.app import HttpFace
 from gateway.faces.modbus.server import ModbusServer
 from gateway.faces.modbus.tls_files import Credentials, load
 from gateway.faces.snmp.agent import SnmpAgent
+from gateway.faces.snmp.log_keeper import LogKeeper
+from gateway.faces.snmp.settings import SnmpSettings
 from gateway.history.keeper import HistoryKeeper
 from gateway.history.source import HistorySource
 from gateway.lines.serial import SerialLine
@@ -45,6 +47,7 @@ class Plan:
     conditions: Conditions
     history: HistoryStats | None
     snmp: SnmpAgent | None  # None: as before
+    days: LogKeeper | None  # what fills the agent's log table
     access: Access
     tls: Credentials | None
 
@@ -65,9 +68,8 @@ class Gateway:
             self.site, clock, not_ready=self.not_ready, history=self._history, state_dir=kept.directory
         )
         self._snmp_settings = snmp_settings(config)
-        self._snmp = SnmpAgent(
-            self._snmp_settings, self.site, clock, self._modbus_stats, conditions=self._watching.conditions
-        )
+        self._days = self._log_keeper(self._snmp_settings, config, self.site, self._history)
+        self._snmp = self._agent(self._snmp_settings, self.site, self._watching.conditions, self._days)
         self._http = HttpFace(
             http_settings(config),
             self.site,
@@ -114,7 +116,8 @@ class Gateway:
     def keepers(self) -> tuple[Runnable, ...]:
         """What runs beside lines and listeners."""
         notifier = self._snmp.notifier
-        return (self._watching, *self._harvesting, *((notifier,) if notifier.stats else ()), *self._others)
+        days = () if self._days is None else (self._days,)
+        return (self._watching, *self._harvesting, *((notifier,) if notifier.stats else ()), *days, *self._others)
 
     def keep(self, keeper: Runnable) -> None:
         """Have one more keeper; before `run`."""
@@ -153,7 +156,7 @@ class Gateway:
 
     def _plan(self, config: Config, south: South, history: HistoryStats | None, conditions: Conditions) -> Plan:
         problems: list[str] = []
-        access, tls, agent = Access(), None, None
+        access, tls, agent, days = Access(), None, None, self._days
         try:
             access = Access.read(http_settings(config))
             tls_context(http_settings(config))
@@ -171,12 +174,11 @@ class Gateway:
             problems += error.problems
         else:
             if settings != self._snmp_settings or conditions is not self.conditions:
-                agent = SnmpAgent(
-                    settings, south.site, self._clock, self._modbus_stats, conditions=conditions, before=self._snmp
-                )
+                days = self._log_keeper(settings, config, south.site, history)
+                agent = self._agent(settings, south.site, conditions, days, self._snmp)
         if problems:
             raise ConfigError(tuple(problems))
-        return Plan(config, south, conditions, history, agent, access, tls)
+        return Plan(config, south, conditions, history, agent, days, access, tls)
 
     async def change(self, plan: Plan) -> None:
         """Come to another configuration: a step that nobody sees half of; then what goes stops, what comes is tried."""
@@ -188,7 +190,7 @@ class Gateway:
         self._watching.adjust(plan.conditions, plan.history)
         self._modbus.adjust(modbus_settings(config), south.site, plan.tls)
         if plan.snmp is not None:
-            self._snmp_settings = plan.snmp.settings
+            self._snmp_settings, self._days = plan.snmp.settings, plan.days
             self._snmp.adjust(plan.snmp)
             self._tell(tuple(plan.conditions.active()), self._clock.monotonic())  # receivers that are new know nothing
         self._http.adjust(
@@ -207,6 +209,34 @@ class Gateway:
 
     def _tell(self, watches: Sequence[Watch], now: float) -> None:
         self._snmp.notifier.changed(watches, now)
+
+    def _agent(
+        self,
+        settings: SnmpSettings,
+        site: Site,
+        conditions: Conditions,
+        days: LogKeeper | None,
+        before: SnmpAgent | None = None,
+    ) -> SnmpAgent:
+        return SnmpAgent(
+            settings,
+            site,
+            self._clock,
+            self._modbus_stats,
+            conditions=conditions,
+            clients=self._modbus.clients,
+            days=None if days is None else days.days,
+            before=before,
+        )
+
+    def _log_keeper(
+        self, settings: SnmpSettings, config: Config, site: Site, history: HistoryStats | None
+    ) -> LogKeeper | None:
+        """What fills the log table, where there is one."""
+        source = self._log(config)
+        if source is None or history is None or not settings.log_table or not (settings.communities or settings.users):
+            return None
+        return LogKeeper(site, source, history)
 
     def _log(self, config: Config) -> HistorySource | None:
         return HistorySource(history_settings(config).directory, config.site) if config.history.enabled else None

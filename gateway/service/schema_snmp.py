@@ -196,6 +196,14 @@ class SnmpTable(Table):
             " or leave SNMPv3 off. The first start needs a new one.",
         ),
     ] = "new"
+    log_table: Annotated[
+        bool,
+        Key(
+            "true or false",
+            "Show the newest 256 days of each controller's log, when there is a history: 3300 cells a controller,"
+            " behind everything else.",
+        ),
+    ] = True
     community: Annotated[
         Annotated[tuple[CommunityTable, ...], Field(strict=False)],
         Key("[[snmp.community]] tables", "Who may read by SNMP v2c; without one nobody can."),

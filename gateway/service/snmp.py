@@ -55,6 +55,7 @@ def snmp_settings(config: Config) -> SnmpSettings:
         requests_per_s=snmp.requests_per_s,
         emc1=emc1_devices(config, listen=snmp_on(config)),
         receivers=receivers(config, dict(zip((user.name for user in snmp.user), credentials, strict=True))),
+        log_table=snmp.log_table,
         authentication_traps=snmp.authentication_traps,
     )
 

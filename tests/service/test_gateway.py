@@ -135,13 +135,14 @@ def test_the_history_gets_its_settings() -> None:
     text = f'state_dir = "/srv/gateway"\n{TEXT}[history]\ninterval_h = 6.0\n'
     settings = history_settings(parse_config(text))
     assert (settings.directory, settings.interval_s) == (Path("/srv/gateway"), 21600)
-    assert [keeper.name for keeper in Gateway(parse_config(text), SystemClock()).keepers] == [
-        "conditions",
-        "history",
-        "trace",
-    ]
+
+    def keepers(text: str) -> list[str]:
+        return [keeper.name for keeper in Gateway(parse_config(text), SystemClock()).keepers]
+
+    assert keepers(text) == ["conditions", "history", "log table", "trace"]
+    assert keepers(text.replace("[snmp]\n", "[snmp]\nlog_table = false\n")) == ["conditions", "history", "trace"]
     off = text.replace("interval_h = 6.0", "enabled = false")
-    assert [keeper.name for keeper in Gateway(parse_config(off), SystemClock()).keepers] == ["conditions", "trace"]
+    assert keepers(off) == ["conditions", "trace"]
 
 
 def test_the_face_gives_up_before_the_supervisor_does(config: Config) -> None:

@@ -145,4 +145,4 @@ def test_the_gateway_runs_what_is_configured(folder: Path) -> None:
     config = parse_config(
         f"{text(folder, table(user='noc'))}\n".replace("site =", f'state_dir = "{folder}"\nsite =', 1)
     )
-    assert [keeper.name for keeper in Gateway(config, StubClock()).keepers][-1] == "notifications"
+    assert "notifications" in [keeper.name for keeper in Gateway(config, StubClock()).keepers]

@@ -11,19 +11,22 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import gateway
 from gateway.clock import Clock
+from gateway.core.clients import Client
 from gateway.core.conditions import Conditions
 from gateway.core.site import Site
 from gateway.core.stats import ModbusServerStats
 from gateway.errors import ListenError
 from gateway.faces.snmp import entity, standard
+from gateway.faces.snmp.client_rows import ClientRows
 from gateway.faces.snmp.counters import SnmpCounters
 from gateway.faces.snmp.emc1 import context_of, emc1_tree
 from gateway.faces.snmp.engine import Engine, EngineLost, start_engine
 from gateway.faces.snmp.layout import Layout, shipped_layout
+from gateway.faces.snmp.log_table import LogDays
 from gateway.faces.snmp.notifier import Notifier
 from gateway.faces.snmp.objects import Gateway
 from gateway.faces.snmp.responder import DATAGRAM_LIMIT, Refused, Responder
@@ -56,10 +59,13 @@ class SnmpAgent:
         modbus: ModbusServerStats,
         *,
         conditions: Conditions | None = None,
+        clients: Iterable[Client] = (),
+        days: LogDays | None = None,
         before: SnmpAgent | None = None,
     ) -> None:
         """Without `conditions` of somebody who tells them of the gateway, those of lines and devices are shown.
 
+        `clients` are those of the Modbus TCP face at any moment, `days` the log table; without it there is none.
         With `before` it is made to be given to that one's `adjust`: same counters, same engine, same uptime.
         """
         self.counters: SnmpCounters = SnmpCounters() if before is None else before.counters
@@ -83,10 +89,11 @@ class SnmpAgent:
                 *entity.CAPABILITIES,
             ),
             authentication_traps=settings.authentication_traps,
+            clients=ClientRows(clients),
             conditions=conditions if conditions is not None else Conditions(site, (), clock.monotonic()),
         )
         groups = (*standard.GROUPS, entity.GENERAL)
-        self.tree: Tree = whole(self.layout, described, groups, (standard.CAPABILITIES, *entity.TABLES))
+        self.tree: Tree = whole(self.layout, described, groups, (standard.CAPABILITIES, *entity.TABLES), days)
         contexts: Mapping[bytes, Tree] = {b"": self.tree} | {
             context_of(each.unit_id): emc1_tree(described, site.by_unit[each.unit_id]) for each in settings.emc1
         }

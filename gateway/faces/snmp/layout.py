@@ -5,7 +5,7 @@ root                     PROSTAR-GATEWAY-REG-MIB, the one configurable OID
  ├ 1 modules             1 PROSTAR-GATEWAY-TC-MIB   2 PROSTAR-GATEWAY-MIB
  │      2.0 notifications
       2.1 objects      1 gateway 2 line 3 device 4 live 5 energy 6 today 7 settings 8 condition 9 Modbus server
-                       10 what only notifications carry
+                       10 what only notifications carry 11 Modbus client 100 log, which is the last
  │      2.2 conformance  1 groups 2 compliances
  └ 2 products            1 this gateway (sysObjectID)
 ```
@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 from gateway.devices.agreement import all_maps
 from gateway.devices.model import Bit, DeviceMap, EnumValue, Group, Point
 from gateway.errors import MapError
-from gateway.faces.snmp import condition_tables, notifications, tables
+from gateway.faces.snmp import client_table, condition_tables, log_columns, notifications, tables
 from gateway.faces.snmp.objects import (
     CellValue,
     Changes,
@@ -167,12 +167,38 @@ def layout(maps: Iterable[DeviceMap], root: Oid = DEFAULT_ROOT) -> Layout:
         )
         for number, name, group, description in _POINT_TABLES
     )
+    last = (
+        Table(
+            (*objects, 11),
+            11,
+            "pgwClient",
+            "The Modbus TCP clients that asked last.",
+            RowKind.CLIENT,
+            "pgwClientIndex",
+            client_table.CLIENT,
+            indexes=(client_table.INDEX,),
+        ),
+        Table(
+            (*objects, 100),
+            100,
+            "pgwLog",
+            "The newest 256 days of each device's daily log, from the history. Always the last table; an agent may be "
+            "configured to leave it out.",
+            RowKind.LOG,
+            "pgwDeviceUnitId",
+            log_columns.log_columns(by_model, object_name, columns.convention),
+            index_of="pgwDevice",
+            indexes=(log_columns.INDEX,),
+        ),
+    )
     notify = ScalarGroup((*objects, 10), 10, "pgwNotify", "What only notifications carry.", notifications.NOTIFY)
     described = [each for group in (*groups, notify) for each in group.objects]
-    described += [column for table in (*fixed, *of_points) for column in table.columns]
+    described += [column for table in (*fixed, *of_points, *last) for column in table.columns]
     in_use = {each.convention.name: each.convention for each in described if each.convention is not None}
     conventions = tuple(in_use[name] for name in sorted(in_use))
-    return Layout(root, groups, tuple(table for table in (*fixed, *of_points) if table.columns), conventions, notify)
+    return Layout(
+        root, groups, tuple(table for table in (*fixed, *of_points, *last) if table.columns), conventions, notify
+    )
 
 
 def shipped_layout(root: Oid = DEFAULT_ROOT) -> Layout:
@@ -261,10 +287,10 @@ class _Columns:
         convention = None
         get: Callable[[DeviceRow, float], CellValue]
         if syntax is Syntax.BITS:
-            convention = self._convention(point.bits, where)
+            convention = self.convention(point.bits, where)
             get = _bits_getter(point.name, point.words)
         elif syntax is Syntax.ENUMERATION:
-            convention = self._convention(point.enumeration, where)
+            convention = self.convention(point.enumeration, where)
             get = _number_getter(point.name, 1, syntax)
         elif syntax is Syntax.TEXT:
             get = _text_getter(point.name)
@@ -285,7 +311,8 @@ class _Columns:
             point=point.name,
         )
 
-    def _convention(self, key: str | None, where: str) -> Convention:
+    def convention(self, key: str | None, where: str) -> Convention:
+        """The convention of an enumeration or a bit table, for the point or field that is said in words."""
         if key is None or key not in self._conventions:
             raise MapError(f"{where}: its syntax needs an enumeration or a bit table")
         return self._conventions[key]

@@ -12,7 +12,7 @@ Rules:
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum, StrEnum
 from typing import Any
 
@@ -20,6 +20,7 @@ from gateway.core.conditions import Conditions, DeviceConditions, Watch
 from gateway.core.site import Device, LinePort, Site
 from gateway.core.stats import ModbusServerStats
 from gateway.devices.model import Point
+from gateway.faces.snmp.client_rows import ClientRows
 from gateway.faces.snmp.counters import SnmpCounters
 from gateway.faces.snmp.settings import Oid
 
@@ -74,6 +75,7 @@ class Gateway:
     capabilities: tuple[tuple[Oid, str], ...]  # rows of sysORTable
     conditions: Conditions | None = None  # None: nobody watches them
     authentication_traps: bool = False  # whether authenticationFailure is sent
+    clients: ClientRows = field(default_factory=ClientRows)
 
     def ticks(self, at: float) -> int:
         """Moment `at` as sysUpTime, hundredths of a second; 0 for moments before the start."""
@@ -106,6 +108,14 @@ class ConditionRow:
 
 
 @dataclass(frozen=True, slots=True)
+class ClientRow:
+    """A row of the table of Modbus TCP clients, whoever is in it."""
+
+    gateway: Gateway
+    number: int  # 1 and above
+
+
+@dataclass(frozen=True, slots=True)
 class CapabilityRow:
     """A row of sysORTable."""
 
@@ -124,7 +134,7 @@ class EntityRow:
     point: Point | None = None  # with a device only
 
 
-Row = Gateway | LineRow | DeviceRow | ConditionRow | CapabilityRow | EntityRow
+Row = Gateway | LineRow | DeviceRow | ConditionRow | ClientRow | CapabilityRow | EntityRow
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,6 +186,8 @@ class RowKind(Enum):
     LINE = "line"
     DEVICE = "device"
     CONDITION = "condition"
+    CLIENT = "client"
+    LOG = "log"
     CAPABILITY = "capability"
     ENTITY = "entity"
     SENSOR = "sensor"  # those entities that measure

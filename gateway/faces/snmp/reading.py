@@ -18,12 +18,13 @@ MOST_CELLS = 1000
 class Reading:
     """What one request finds; names are encoded OIDs, varbinds encoded VarBinds."""
 
-    __slots__ = ("_now", "_window", "spans")
+    __slots__ = ("_lasts", "_now", "_window", "spans")
 
     def __init__(self, window: Window, now: float) -> None:
         self._window = window
         self._now = now
         self.spans: list[tuple[int, int]] = []  # places looked at, the end not among them
+        self._lasts = True  # nothing was looked for in what changes without a snapshot
 
     def get(self, name: bytes) -> tuple[bytes, bool]:
         """The varbind for a name, and whether it has a value."""
@@ -37,7 +38,12 @@ class Reading:
             if varbind is not None:
                 return varbind, True
             return wire.varbind(name, wire.NO_SUCH_INSTANCE), False
-        missing = wire.NO_SUCH_INSTANCE if window.has_object(reader.oid(name)) else wire.NO_SUCH_OBJECT
+        oid = reader.oid(name)
+        varbind = window.tails.get(oid, self._now)
+        self._lasts = self._lasts and not window.tails.tails
+        if varbind is not None:
+            return varbind, True
+        missing = wire.NO_SUCH_INSTANCE if window.has_object(oid) else wire.NO_SUCH_OBJECT
         return wire.varbind(name, missing), False
 
     def next(self, name: bytes) -> tuple[bytes, bool]:
@@ -46,7 +52,8 @@ class Reading:
         found = self._window.from_place(start, self._now)
         if found is None:
             self.spans.append((start, self._window.size))
-            return wire.varbind(name, wire.END_OF_MIB_VIEW), False
+            step = self._in_tail(name)
+            return (step[1], True) if step is not None else (wire.varbind(name, wire.END_OF_MIB_VIEW), False)
         self.spans.append((start, found[0] + 1))
         return found[1], True
 
@@ -76,6 +83,8 @@ class Reading:
 
     def devices(self) -> list[Device] | None:
         """The devices that the result depends on; None when it depends on more than snapshots, or too many cells."""
+        if not self._lasts:
+            return None
         window = self._window
         watched: set[Device] = set()
         cells = 0
@@ -94,6 +103,13 @@ class Reading:
                 place += many
         return list(watched)
 
+    def _in_tail(self, name: bytes) -> tuple[bytes, bytes] | None:
+        """The name and varbind of the first cell of the tails behind a name, or None at the end."""
+        tails = self._window.tails
+        self._lasts = self._lasts and not tails.tails
+        found = tails.after(reader.oid(name), self._now)
+        return None if found is None else (wire.object_identifier(found[0]), found[1])
+
     def _behind(self, name: bytes) -> int:
         """The first place behind a name."""
         window = self._window
@@ -106,15 +122,14 @@ class Reading:
         place = ends[0]
         column: Column | None = None
         at = many = 0
-        for _ in range(repetitions):
+        for done in range(repetitions):
             varbind = column.varbind(at, now) if column is not None and at < many else None
             if varbind is None:
                 found = window.from_place(place, now)
                 if found is None:
                     ends[0] = window.size
-                    varbind = wire.varbind(name if column is None else column.name(at - 1), wire.END_OF_MIB_VIEW)
-                    if len(varbind) <= left:
-                        out.append(varbind)
+                    last = name if column is None else column.name(at - 1)
+                    self._rest(last, repetitions - done, left, out)
                     return
                 place, varbind = found
                 number, at = window.locate(place)
@@ -128,6 +143,19 @@ class Reading:
                 return
             out.append(varbind)
 
+    def _rest(self, name: bytes, repetitions: int, left: int, out: list[bytes]) -> None:
+        """`repetitions` steps behind a name that has only the tails behind it."""
+        for _ in range(repetitions):
+            step = self._in_tail(name)
+            varbind = wire.varbind(name, wire.END_OF_MIB_VIEW) if step is None else step[1]
+            left -= len(varbind)
+            if left < 0:
+                return
+            out.append(varbind)
+            if step is None:
+                return
+            name = step[0]
+
     def _columns(self, names: list[bytes], places: list[int], repetitions: int, left: int, out: list[bytes]) -> None:
         """The same behind several names in turn."""
         window, now = self._window, self._now
@@ -137,8 +165,12 @@ class Reading:
             for position, place in enumerate(places):
                 found = from_place(place, now)
                 if found is None:
-                    varbind = wire.varbind(names[position], wire.END_OF_MIB_VIEW)
+                    step = self._in_tail(names[position])
+                    varbind = wire.varbind(names[position], wire.END_OF_MIB_VIEW) if step is None else step[1]
                     places[position] = window.size
+                    if step is not None:
+                        names[position] = step[0]
+                        ended = False
                 else:
                     at, varbind = found
                     places[position] = at + 1

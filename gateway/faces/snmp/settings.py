@@ -114,4 +114,5 @@ class SnmpSettings:
     reply_octets: int = REPLY_LIMIT
     emc1: tuple[Emc1Device, ...] = ()
     receivers: tuple[Receiver, ...] = ()
+    log_table: bool = True  # whether the days of a history are shown, where there is one
     authentication_traps: bool = False  # whether receivers are told of wrong credentials

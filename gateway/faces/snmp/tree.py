@@ -18,9 +18,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import accumulate
 
 from gateway.core.site import Device
+from gateway.faces.snmp.client_tail import ClientTail
 from gateway.faces.snmp.columns import Cell, Column, Rows, column_of
 from gateway.faces.snmp.entity import entities
 from gateway.faces.snmp.layout import Layout
+from gateway.faces.snmp.log_table import LogDays, LogTail
 from gateway.faces.snmp.objects import (
     CapabilityRow,
     ConditionRow,
@@ -34,16 +36,30 @@ from gateway.faces.snmp.objects import (
     Table,
 )
 from gateway.faces.snmp.settings import Oid, View
+from gateway.faces.snmp.tails import Tail, Tails
 
 LEAP_AFTER = 2
 _SCALAR: Oid = (0,)
 
 
+NO_TAILS = Tails(())
+
+
 class Window:
     """The cells that one view shows of one tree, in order."""
 
-    def __init__(self, columns: Sequence[Column], objects: frozenset[Oid], devices: Sequence[Device]) -> None:
-        """`columns` in order, none of them empty; `objects` are those of which noSuchInstance may be said."""
+    def __init__(
+        self,
+        columns: Sequence[Column],
+        objects: frozenset[Oid],
+        devices: Sequence[Device],
+        tails: Tails = NO_TAILS,
+    ) -> None:
+        """`columns` in order, none of them empty, and `tails` behind them.
+
+        `objects` are those of which noSuchInstance may be said.
+        """
+        self.tails = tails
         self.columns = tuple(columns)
         self.starts = [0, *accumulate(column.size for column in columns)]  # the last one is behind the end
         self.size = self.starts[-1]
@@ -79,17 +95,18 @@ class Window:
     def get(self, oid: Oid, now: float) -> bytes | None:
         """The varbind of exactly this OID, or None."""
         place = self.place_after(oid) - 1
-        if place < 0:
-            return None
-        number, at = self.locate(place)
-        column = self.columns[number]
-        return column.varbind(at, now) if (*column.base, *column.rows.indexes[at]) == oid else None
+        if place >= 0:
+            number, at = self.locate(place)
+            column = self.columns[number]
+            if (*column.base, *column.rows.indexes[at]) == oid:
+                return column.varbind(at, now)
+        return self.tails.get(oid, now)
 
     def after(self, oid: Oid, now: float) -> tuple[Oid, bytes] | None:
         """The first instantiated cell behind `oid` in lexicographic order, or None at the end."""
         found = self.from_place(self.place_after(oid), now)
         if found is None:
-            return None
+            return self.tails.after(oid, now)
         number, at = self.locate(found[0])
         column = self.columns[number]
         return (*column.base, *column.rows.indexes[at]), found[1]
@@ -152,9 +169,14 @@ class Tree(Window):
     """Everything the agent can answer."""
 
     def __init__(
-        self, gateway: Gateway, groups: Sequence[ScalarGroup], tables: Sequence[Table], single: Row | None = None
+        self,
+        gateway: Gateway,
+        groups: Sequence[ScalarGroup],
+        tables: Sequence[Table],
+        single: Row | None = None,
+        tails: Tails = NO_TAILS,
     ) -> None:
-        """`single` is what the scalars are of, when not of the gateway."""
+        """`single` is what the scalars are of, when not of the gateway; `tails` lie behind everything else."""
         alone = Rows([(_SCALAR, gateway if single is None else single)])
         columns = [
             column_of((*group.base, described.number), described, alone)
@@ -170,14 +192,18 @@ class Tree(Window):
         objects = frozenset((*group.base, each.number) for group in groups for each in group.objects) | frozenset(
             (*table.base, 1, column.number) for table in tables for column in table.columns
         )
-        super().__init__(columns, objects, gateway.site.devices)
+        if tails.tails and columns and columns[-1].base > tails.tails[0].base:
+            raise ValueError(f"{columns[-1].base} lies behind a table that must be one of the last")
+        super().__init__(columns, objects, gateway.site.devices, tails)
 
     def window(self, view: View) -> Window:
         """What `view` shows of the tree."""
         columns = [shown for column in self.columns if (shown := _shown_of(column, view)) is not None]
-        if len(columns) == len(self.columns) and all(map(lambda a, b: a is b, columns, self.columns)):
+        tails = self.tails.through(view)
+        same = len(columns) == len(self.columns) and all(map(lambda a, b: a is b, columns, self.columns))
+        if same and tails is self.tails:
             return self
-        return Window(columns, frozenset(oid for oid in self._objects if view.shows(oid)), self._devices)
+        return Window(columns, frozenset(oid for oid in self._objects if view.shows(oid)), self._devices, tails)
 
 
 def _columns(table: Table, rows: Rows) -> Iterator[Column]:
@@ -207,9 +233,21 @@ def _shown_of(column: Column, view: View) -> Column | None:
     return column_of(base, column.object, column.rows.only(having)) if having else None
 
 
-def whole(layout: Layout, gateway: Gateway, groups: Sequence[ScalarGroup], tables: Sequence[Table]) -> Tree:
-    """The tree of the layout together with the standard `groups` and `tables`."""
-    return Tree(gateway, (*groups, *layout.groups), (*tables, *layout.tables))
+def whole(
+    layout: Layout,
+    gateway: Gateway,
+    groups: Sequence[ScalarGroup],
+    tables: Sequence[Table],
+    days: LogDays | None = None,
+) -> Tree:
+    """The tree of the layout together with the standard `groups` and `tables`; without `days` it has no log."""
+    by_kind = {table.rows: table for table in layout.tables}
+    log = by_kind[RowKind.LOG]
+    own = layout.tables if days is not None else tuple(table for table in layout.tables if table is not log)
+    tails: list[Tail] = [ClientTail(by_kind[RowKind.CLIENT], gateway)]
+    if days is not None:
+        tails.append(LogTail(log, days))
+    return Tree(gateway, (*groups, *layout.groups), (*tables, *own), tails=Tails(tails))
 
 
 Found = list[tuple[Oid, Row]]
@@ -230,6 +268,8 @@ _ROWS: Mapping[RowKind, Callable[[Gateway], Found]] = {
     RowKind.LINE: lambda gateway: [((line.index,), LineRow(gateway, line)) for line in gateway.site.lines],
     RowKind.DEVICE: lambda gateway: [((each.unit_id,), DeviceRow(gateway, each)) for each in gateway.site.devices],
     RowKind.CONDITION: _conditions,
+    RowKind.CLIENT: lambda _gateway: [],  # see client_tail.py
+    RowKind.LOG: lambda _gateway: [],  # see log_table.py
     RowKind.CAPABILITY: lambda gateway: [
         ((at + 1,), CapabilityRow(gateway, at)) for at in range(len(gateway.capabilities))
     ],

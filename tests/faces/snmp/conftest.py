@@ -9,13 +9,17 @@ from pathlib import Path
 
 import pytest
 
+from gateway.core.clients import ClientTable
+from gateway.core.ratelimit import ClientRate
 from gateway.core.site import Device, LineState, Site
 from gateway.core.stats import ModbusServerStats
 from gateway.devices.model import DeviceMap
 from gateway.devices.schema import load_map
 from gateway.faces.snmp.agent import SnmpAgent
+from gateway.faces.snmp.log_table import LogDays, days_of
 from gateway.faces.snmp.settings import Community, SnmpSettings
 from gateway.generate.mib import mib_outputs
+from tests.faces.snmp import stub_site
 from tests.faces.snmp.stub_site import NOW, REPOSITORY, Ask, StubClock, StubLine, listening, online, run_tool
 
 
@@ -66,10 +70,17 @@ def settings() -> SnmpSettings:
 
 @pytest.fixture
 def make_agent(
-    site: Site, clock: StubClock, settings: SnmpSettings, modbus_stats: ModbusServerStats
+    site: Site, clock: StubClock, settings: SnmpSettings, modbus_stats: ModbusServerStats, device_map: DeviceMap
 ) -> Callable[..., SnmpAgent]:
+    days = LogDays()
+    days.put(11, days_of(device_map, stub_site.log(24, 48)))
+    days.put(21, days_of(device_map, stub_site.log(24)))
+    clients = ClientTable(ModbusServerStats(), 2.0)
+    clients.arrived("192.0.2.7", ClientRate(), NOW)
+
     def make(**changes: object) -> SnmpAgent:
-        return SnmpAgent(replace(settings, **changes), site, clock, modbus_stats)  # type: ignore[arg-type]
+        changed = replace(settings, **changes)  # type: ignore[arg-type]
+        return SnmpAgent(changed, site, clock, modbus_stats, clients=clients, days=days)
 
     return make
 

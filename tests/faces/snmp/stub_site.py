@@ -9,6 +9,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from gateway.core.daylog import LoggedDay
 from gateway.core.site import Device, LineState, LineStatus, Outcome, Ticket
 from gateway.core.snapshot import DeviceState, Snapshot
 from gateway.core.stats import LineStats
@@ -90,6 +91,24 @@ def online(device_map: DeviceMap, unit_id: int, at: float = NOW) -> Snapshot:
         identification=Identification("Morningstar Corp.", "PS-MPPT-40M", "v01.02.13"),
         serial_number="16250001",
     )
+
+
+def log(*hours: int) -> list[LoggedDay]:
+    """Days with a value in every field."""
+    values: dict[str, Value] = {
+        "alarms": 1,
+        "load_faults": 1,
+        "array_faults": 1,
+        "battery_voltage_minimum": 11.5,
+        "battery_voltage_maximum": 14.4,
+        "charge": 12.25,
+        "load_charge": 9.5,
+        "array_voltage_maximum": 60.5,
+        "absorption_time": 3600,
+        "equalize_time": 0,
+        "float_time": 120,
+    }
+    return [LoggedDay(each, values, 1.7e9, 1800.0) for each in hours]
 
 
 def stale(snapshot: Snapshot) -> Snapshot:
