@@ -35,8 +35,8 @@ test: setup lint ## Set everything up, lint, and run the tests with coverage.
 	@$(BIN)/python -m pytest -m 'not long' -n $(JOBS) --cov --cov-report=
 
 .PHONY: test-long
-test-long: setup ## Run the long tier: whole simulated days.
-	@$(BIN)/python -m pytest -m long --timeout=3600
+test-long: setup ## Run the long tiers: whole days, chaos, churn, restarts, installation; SOAK_S=3600 makes chaos an hour.
+	@$(BIN)/python -m pytest -m long -n $(JOBS) --timeout=3600
 
 .PHONY: test-newest
 test-newest: setup ## Run what depends on libraries with the newest versions that pyproject.toml allows.

@@ -94,8 +94,8 @@ place_files() {
 restart() { ! has_systemd || systemctl try-restart "$unit"; }
 
 install_release() {
-  local wheels=$1 before version new
-  before=$(release current)
+  local wheels=$1 before older version new
+  before=$(release current) older=$(release previous)
   version=$(sed -n 's/^version = "\(.*\)"$/\1/p' "$clone/pyproject.toml")
   mkdir -p "$home/releases"
   new=$home/releases/$version-$(date -u +%Y%m%dT%H%M%S)
@@ -114,8 +114,10 @@ install_release() {
   if ! restart; then
     [[ -n $before ]] || fail "the service does not start: journalctl -u $unit"
     point current "$before"
+    if [[ -n $older ]]; then point previous "$older"; else rm -f "$home/previous"; fi
     place_files "$before"
     restart || true
+    rm -rf "$new"
     fail "release $version does not start, so $(basename "$before") is in use again: journalctl -u $unit"
   fi
   local each

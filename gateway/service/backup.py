@@ -198,11 +198,11 @@ def _exchange(folder: Path, state_dir: Path, now: float) -> Path | None:
     there = [path for path in state_dir.iterdir() if path.is_file()]
     if there:
         moved = _new_folder(state_dir, time.strftime("replaced-%Y%m%dT%H%M%SZ", time.gmtime(now)))
+        _give(moved, owner)
         for path in there:
             path.rename(moved / path.name)
     for path in sorted(folder.iterdir()):
-        if os.geteuid() == 0:
-            os.chown(path, owner.st_uid, owner.st_gid)
+        _give(path, owner)
         path.rename(state_dir / path.name)
     fd = os.open(state_dir, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -210,6 +210,11 @@ def _exchange(folder: Path, state_dir: Path, now: float) -> Path | None:
     finally:
         os.close(fd)
     return moved
+
+
+def _give(path: Path, owner: os.stat_result) -> None:
+    if os.geteuid() == 0:
+        os.chown(path, owner.st_uid, owner.st_gid)
 
 
 def _new_folder(parent: Path, name: str) -> Path:

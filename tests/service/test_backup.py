@@ -297,4 +297,5 @@ def test_restored_files_belong_to_whom_the_folder_belongs(state: Path, tmp_path:
     new.mkdir()
     os.chown(new, 61234, 61234)
     restore(archive, new, LATER)
+    restore(archive, new, LATER)  # and the folder of what was there before
     assert {(path.stat().st_uid, path.stat().st_gid) for path in new.iterdir()} == {(61234, 61234)}

@@ -171,6 +171,7 @@ class Connection(asyncio.Protocol):
         self._due.clear()
         self._adus.clear()
         self._input = b""
+        self._write = _nowhere
         self._left(self)
 
     # What the server calls

@@ -117,6 +117,10 @@ class Hub:
                 call(events)
 
 
+_NOBODY = asyncio.Protocol()
+"""Whom a transport that ended tells nothing."""
+
+
 class SocketTransport(asyncio.Transport):
     """One client's socket."""
 
@@ -282,7 +286,8 @@ class SocketTransport(asyncio.Transport):
         asyncio.get_running_loop().call_soon(self._end, error)
 
     def _end(self, error: OSError | None) -> None:
+        protocol, self._protocol = self._protocol, _NOBODY  # no circle: it is freed without the collector
         try:
-            self._protocol.connection_lost(error)
+            protocol.connection_lost(error)
         finally:
             self._sock.close()
