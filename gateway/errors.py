@@ -162,6 +162,24 @@ class ReplyTimeout(DeviceSilent):
     label = "timeout"
 
 
+class ConnectionLost(ReplyTimeout):
+    """The connection to the upstream ended before the reply came."""
+
+    label = "connection_lost"
+
+
+class RelayedSilence(ReplyTimeout):
+    """An upstream gateway says that the device gave it no answer (its exception 0B)."""
+
+    label = "exception"
+
+
+class RelayedNoPath(RelayedSilence):
+    """An upstream gateway says that it has no way to the device (its exception 0A)."""
+
+    exception_code = 0x0A
+
+
 class DeviceOffline(DeviceSilent):
     """The device is quarantined; refused at once, without waiting."""
 

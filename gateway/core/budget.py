@@ -6,7 +6,7 @@ a transaction. The turnaround is not documented; `TURNAROUND_S` is assumed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from gateway.core.settings import LineSettings
@@ -19,6 +19,7 @@ TURNAROUND_S = 0.015
 REQUEST_BYTES = 8
 REPLY_OVERHEAD_BYTES = 5
 LONGEST_FRAME_BYTES = 256
+UPSTREAM_BYTE_S = 1e-5
 WATCH_S = 1.0
 """A face looks so often for requests that nobody has answered."""
 
@@ -60,6 +61,22 @@ def line_budget(settings: LineSettings, maps: Sequence[DeviceMap], *, timeouts_s
         # One transaction may be under way when the queue time ends; before each try there may be a settling question.
         reply_deadline_s=settings.queue_limit_s + (2 * (settings.retries + 1) + 1) * attempt_s + WATCH_S,
     )
+
+
+def read_cost(settings: LineSettings) -> Callable[[Space, int], float]:
+    """What one read costs of the line's time, in seconds; of an upstream only how reads compare with each other."""
+    if settings.upstream is not None:
+        return _upstream_read_s
+    timing = settings.timing()
+    return lambda space, count: read_s(timing, space, count)
+
+
+def _upstream_read_s(space: Space, count: int) -> float:
+    """Only the data count, so that reads are joined where they overlap, and holes between them are not read.
+
+    What is read without being asked for may lie in two blocks of the upstream's memory, and so have to be fetched.
+    """
+    return (2 * count if space is Space.REGISTERS else (count + 7) // 8) * UPSTREAM_BYTE_S
 
 
 def read_s(timing: Timing, space: Space, count: int) -> float:

@@ -1,7 +1,7 @@
 """The line engine: one owner of a line, sans-IO, with time as an argument.
 
-Rule 1: one transaction at a time; the next request goes out only when the RTU client says so (gap kept,
-        quarantine over) and the scheduler says whose turn it is.
+Rule 1: the next request goes out only when the wire says so (a serial line: one transaction at a time, gap kept,
+        quarantine over; an upstream: room for one more) and the scheduler says whose turn it is.
 Rule 2: a client's read is tried `retries` times more, a poll waits for its next turn instead, a write is never
         repeated: when its answer is missing, nobody knows, and the old value is forgotten.
 Rule 3: an exception to reads that were joined is nobody's answer: they are made again, apart.
@@ -14,8 +14,12 @@ Rule 7: after a missed reply its device answers a small question of another kind
         The turn that has to wait for it is held; when there is no answer, it is the turn that has failed.
 Rule 8: a client's read that the device is too busy for (exception 06) is made once more, if there are retries at
         all; every other exception, and a second 06, is the answer.
-Rule 9: a line that stops (`finish`) lets the transaction on the wire run to its end, begins nothing more, and ends
-        all else that waits or comes with 06.
+Rule 9: a line that stops (`finish`) lets what is under way run to its end, begins nothing more, and ends all else
+        that waits or comes with 06.
+Rule 10: a request that ended through no fault of its own (an upstream's connection was lost, or others were under way
+        with it) is made once more, with the line to itself. Nobody counts it against the device. A write is not.
+Rule 11: what a gateway says in the place of a device (exceptions 0A and 0B of an upstream) is the answer to clients,
+        and a missed reply of that device.
 
 The shell calls `opened`, `closed`, `receive`, `on_timer`, `read` and `write`, then `step` until it returns None,
 writing what it returns, and comes back at `next_deadline`. Outcomes are handed out by `step` only.
@@ -24,23 +28,25 @@ writing what it returns, and comes back at `next_deadline`. Outcomes are handed 
 from __future__ import annotations
 
 import logging
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from random import Random
 
 from gateway.core.accounting import Accounting
-from gateway.core.budget import read_s
-from gateway.core.coalescing import part
+from gateway.core.budget import read_cost
 from gateway.core.device_record import DeviceRecord
-from gateway.core.health import Breaker
+from gateway.core.health import FIRST_PROBE_S, LAST_PROBE_S, Breaker
 from gateway.core.polling import Polling
-from gateway.core.requests import ClientRead, Lane, PollItem, Purpose, ReadTurn, Span, Turn, Waiter, WriteTurn
+from gateway.core.requests import Lane, PollItem, Purpose, ReadTurn, Turn, Waiter, WriteTurn
 from gateway.core.scheduler import PollList, Scheduler
+from gateway.core.set_aside import SetAside
 from gateway.core.settings import LineSettings
 from gateway.core.site import Device, LineState, LineStatus, Outcome
 from gateway.core.snapshot import IDENTITY_MISMATCH, DeviceState
 from gateway.core.stats import LineStats
-from gateway.devices.model import Point
+from gateway.core.turns import part_of, span_of, waiters_of, written_point
+from gateway.core.under_way import UnderWay
 from gateway.errors import (
     DeviceOffline,
     DeviceSilent,
@@ -50,40 +56,49 @@ from gateway.errors import (
     LineDown,
     QueueFull,
     QueueTimeout,
+    RelayedNoPath,
+    RelayedSilence,
     ReplyTimeout,
     RequestError,
     ShuttingDown,
 )
 from gateway.modbus.collector import Echo
-from gateway.modbus.pdu import Function, is_exception, parse_read
-from gateway.modbus.rtu import Failed, Replied, RtuClient, State
+from gateway.modbus.pdu import Function, is_exception
+from gateway.modbus.rtu_wire import RtuWire
+from gateway.modbus.transactions import Ended, Failed, Replied, Wire
 
 log = logging.getLogger(__name__)
 
 RESTART_S = 15.0
 """How long a device that was told to restart may be silent."""
 
-_READS = frozenset(
-    {
-        Function.READ_COILS,
-        Function.READ_DISCRETE_INPUTS,
-        Function.READ_HOLDING_REGISTERS,
-        Function.READ_INPUT_REGISTERS,
-    }
-)
 _WRITES = frozenset({Function.WRITE_SINGLE_COIL, Function.WRITE_SINGLE_REGISTER})
 _REFUSALS = (0x02, 0x03)
 _BUSY = 0x06
+_RELAYED = {0x0A: RelayedNoPath, 0x0B: RelayedSilence}
 
 
 class LineEngine:
     """Polls, client reads and writes of one line."""
 
-    def __init__(self, settings: LineSettings, devices: Sequence[Device], now: float, rng: Random) -> None:
+    def __init__(
+        self,
+        settings: LineSettings,
+        devices: Sequence[Device],
+        now: float,
+        rng: Random,
+        *,
+        wire: Wire | None = None,
+        stats: LineStats | None = None,
+    ) -> None:
         self.settings = settings
-        self.stats = LineStats()
-        timing = settings.timing()
-        self._rtu = RtuClient(timing, self.stats.wire, quarantine_s=settings.quarantine_s)
+        self.stats = stats if stats is not None else LineStats()
+        self._wire: Wire = (
+            wire
+            if wire is not None
+            else RtuWire(settings.timing(), self.stats.wire, quarantine_s=settings.quarantine_s)
+        )
+        self._under_way = UnderWay()
         self._polling = Polling(settings)
         self._records = {
             device.unit_id: DeviceRecord(device, PollList(device, Breaker(rng), self._polling.first(device, now)), now)
@@ -93,14 +108,13 @@ class LineEngine:
             [record.polls for record in self._records.values()],
             limit=settings.queue_limit,
             limit_s=settings.queue_limit_s,
-            cost=lambda space, count: read_s(timing, space, count),
+            cost=read_cost(settings),
             now=now,
+            under_way=self._under_way,
         )
         self._accounting = Accounting(self.stats, now)
-        self._turn: Turn | None = None
-        self._held: Turn | None = None  # waits for the settling question that is on the wire, or was just answered
-        self._window_s = self._calm_window_s = self._rtu.quarantine_s(now)
-        self._sent_at = now
+        self._aside = SetAside(self._under_way)
+        self._window_s = self._calm_window_s = self._wire.quarantine_s(now)
         self._finished: deque[tuple[Waiter, Outcome]] = deque()
         self._state = LineState.DOWN
         self._state_since = now
@@ -110,7 +124,7 @@ class LineEngine:
     @property
     def echo(self) -> Echo:
         """Whether the line gives our own requests back."""
-        return self._rtu.echo
+        return self._wire.echo
 
     def status(self, now: float) -> LineStatus:
         """The line at `now`."""
@@ -120,14 +134,14 @@ class LineEngine:
         known = [refresh_s for refresh_s in refresh if refresh_s is not None]
         stretch = max(1.0, sum(known) / len(known) / self.settings.poll.live_s) if known else 1.0
         use = self._accounting.use_ratio(now)
-        echo = self._rtu.echo.value
+        echo = self._wire.echo.value
         return LineStatus(self._state, self._state_since, self._error, len(self._scheduler), use, stretch, echo)
 
     def opened(self, now: float) -> None:
         """The port is open: everything is read anew, quarantined devices are probed at once."""
         self._set_state(LineState.OPEN, "", now)
         self.stats.opens += 1
-        self._rtu.reset(now)
+        self._wire.reset(now)
         for record in self._records.values():
             record.breaker.line_opened(now)
             self._polling.restart(record, now)
@@ -135,15 +149,13 @@ class LineEngine:
     def closed(self, error: str, now: float) -> None:
         """The port is closed: what waited ends with LineDown, online devices become stale."""
         self._set_state(LineState.DOWN, error, now)
-        self._rtu.reset(now)
-        if self._turn is not None:
-            turn, self._turn = self._turn, None
+        self._wire.reset(now)
+        for turn, sent_at in self._under_way.clear():
             self._records[turn.device.unit_id].doubt.missed(turn.pdu[0])
-            self._accounting.ended(turn, self._sent_at, now, "line_down")
-            self._finish(_waiters(turn), LineDown(error))
-        if self._held is not None:
-            self._finish(_waiters(self._held), LineDown(error))
-            self._held = None
+            self._accounting.ended(turn, sent_at, now, "line_down")
+            self._finish(waiters_of(turn), LineDown(error))
+        for turn in self._aside.clear():
+            self._finish(waiters_of(turn), LineDown(error))
         self._finish(self._scheduler.drain(), LineDown(error))
         for record in self._records.values():
             if record.state is DeviceState.ONLINE:
@@ -156,7 +168,7 @@ class LineEngine:
         waiter = Waiter(done, client, now)
         try:
             self._check(device)
-            span = _span(device, pdu)
+            span = span_of(device, pdu)
             loser = self._scheduler.add_read(device, pdu, span, waiter, lane)
         except RequestError as error:
             self._finish([waiter], error)
@@ -172,9 +184,9 @@ class LineEngine:
             if not self.settings.writes or len(pdu) != 5 or pdu[0] not in _WRITES:
                 raise IllegalFunction("this line sends no such write")
             self._check(device)
-            if self._rtu.echo is Echo.UNKNOWN:
+            if self._wire.echo is Echo.UNKNOWN:
                 raise EchoUnknown("nothing was read on this line yet")
-            point = _written_point(device, pdu)
+            point = written_point(device, pdu)
             lane = Lane.SLAVE_CONTROL if point is not None and point.rewrite_s is not None else Lane.WRITE
             self._scheduler.add_write(WriteTurn(device, pdu, lane, now, waiter))
         except RequestError as error:
@@ -183,8 +195,8 @@ class LineEngine:
 
     @property
     def busy(self) -> bool:
-        """Whether a transaction is on the wire."""
-        return self._turn is not None
+        """Whether a transaction is under way."""
+        return bool(self._under_way)
 
     def adjust(self, settings: LineSettings, now: float) -> None:
         """Go on by other settings of the same wire (`LineSettings.same_wire`)."""
@@ -200,17 +212,11 @@ class LineEngine:
         """Bytes came from the line."""
         if self._state is LineState.DOWN:
             return
-        event = self._rtu.receive(data, now)
-        if event is not None:
-            self._on_event(event, now)
-        self._watch_window(now)
+        self._ended(self._wire.receive(data, now), now)
 
     def on_timer(self, now: float) -> None:
         """A deadline may have passed."""
-        event = self._rtu.on_timer(now)
-        if event is not None:
-            self._on_event(event, now)
-        self._watch_window(now)
+        self._ended(self._wire.on_timer(now), now)
         self._finish(self._scheduler.expired(now), QueueTimeout(f"waited {self.settings.queue_limit_s:g} s"))
         for record in self._records.values():
             if record.rewrites:
@@ -219,34 +225,38 @@ class LineEngine:
     def step(self, now: float) -> bytes | None:
         """Hand out outcomes, then give the frame to write now, or None."""
         if self._finishing:
-            held, self._held = self._held, None
-            waiting = self._scheduler.drain()
-            self._finish(waiting if held is None else waiting + _waiters(held), ShuttingDown())
+            self._finish(self._scheduler.drain(), ShuttingDown())
+            for waiting in self._aside.clear():
+                self._finish(waiters_of(waiting), ShuttingDown())
         while self._finished:
             waiter, outcome = self._finished.popleft()
             try:
                 waiter.finish(outcome)
             except Exception:  # the edge to a face: its mistake must not stop the line
                 log.exception("event=outcome_handler_failed line=%s", self.settings.name)
-        if self._state is LineState.DOWN or self._turn is not None or self._rtu.ready_at(now) > now:
+        if self._state is LineState.DOWN or self._wire.ready_at(now) > now:
             return None
         turn = self._next(now)
         if turn is None:
             return None
         timeout_s = turn.device.reply_timeout_s or self.settings.reply_timeout_s
         try:
-            frame = self._rtu.send(turn.device.address, turn.pdu, now, timeout_s)
+            key, frame = self._wire.send(turn.device.address, turn.pdu, now, timeout_s)
         except RequestError as error:  # a client's PDU that has no meaning on a serial line
             if isinstance(turn, PollItem):
                 raise
-            self._finish(_waiters(turn), error)
+            self._finish(waiters_of(turn), error)
             return self.step(now)
-        self._sent(turn, now)
+        record = self._records[turn.device.unit_id]
+        self._under_way.add(key, turn, now, closed=record.breaker.is_open, alone=self._aside.is_again(turn))
+        self._aside.begun(turn)
+        self._begun(turn, now)
+        self._accounting.sent(turn, now)
         return frame
 
     def bytes_due(self) -> int:
         """How many bytes of the awaited reply are at least still to come."""
-        return self._rtu.bytes_due()
+        return self._wire.bytes_due()
 
     def next_deadline(self, now: float) -> float | None:
         """When the shell must call `on_timer` and `step` again; None: only after an input."""
@@ -254,13 +264,15 @@ class LineEngine:
             return now
         if self._state is LineState.DOWN:
             return None
+        wire_at = self._wire.next_deadline()
         if self._finishing:  # polls are due, and nobody will make them
-            return self._rtu.next_deadline()
-        moments = [self._rtu.next_deadline(), self._scheduler.next_expiry()]
+            return wire_at
+        moments = [wire_at, self._scheduler.next_expiry()]
         moments += [self._polling.next_warning(record) for record in self._records.values() if record.rewrites]
-        if self._turn is None and self._rtu.state is State.IDLE:
-            due = now if self._held is not None else self._scheduler.next_due(now)
-            moments.append(None if due is None else max(due, self._rtu.ready_at(now)))
+        ready_at = self._wire.ready_at(now)
+        if ready_at not in {math.inf, wire_at} and not self._aside.blocks():  # else the wire comes first
+            due = now if self._aside.due() else self._scheduler.next_due(now)
+            moments.append(None if due is None else max(due, ready_at))
         return min((moment for moment in moments if moment is not None), default=None)
 
     def _check(self, device: Device) -> None:
@@ -279,24 +291,16 @@ class LineEngine:
 
     def _next(self, now: float) -> Turn | None:
         """The turn to make now, or the settling question that must be answered before it (rule 7)."""
-        if self._finishing:
+        if self._finishing or self._aside.blocks():
             return None
-        turn, self._held = self._held, None
-        if turn is None or not _wanted(turn):
-            turn = self._scheduler.next(now)
+        turn = self._aside.first() or self._scheduler.next(now)
         if turn is None:
             return None
         record = self._records[turn.device.unit_id]
         if record.doubt.allows(turn.pdu[0]):
             return turn
-        self._held = turn
+        self._aside.hold(turn)
         return self._polling.settling(record, now)
-
-    def _sent(self, turn: Turn, now: float) -> None:
-        self._turn = turn
-        self._sent_at = now
-        self._begun(turn, now)
-        self._accounting.sent(turn, now)
 
     def _begun(self, turn: Turn, now: float) -> None:
         if isinstance(turn, PollItem):
@@ -305,34 +309,50 @@ class LineEngine:
             for read in turn.reads:
                 read.attempts += 1
 
-    def _on_event(self, event: Replied | Failed, now: float) -> None:
-        turn, self._turn = self._turn, None
-        assert turn is not None, "the RTU client reports only what was sent"
-        record = self._records[turn.device.unit_id]
-        if isinstance(event, Failed):
-            self._accounting.ended(turn, self._sent_at, now, event.error.label)
-            record.doubt.missed(turn.pdu[0])
-            if turn.purpose is Purpose.SETTLE:
-                self._on_unsettled(record, event.error, now)
-            else:
-                self._on_failure(turn, record, event.error, now)
-        else:
-            exception = is_exception(event.pdu)
+    def _ended(self, ended: Iterable[Ended], now: float) -> None:
+        """Transactions that the wire ended."""
+        for key, event in ended:
+            turn, sent_at = self._under_way.end(key)
+            record = self._records[turn.device.unit_id]
+            error = event.error if isinstance(event, Failed) else self._relayed(event.pdu)
+            exception = isinstance(event, Replied) and is_exception(event.pdu)
             turn.device.stats.exceptions += exception
-            self._accounting.ended(turn, self._sent_at, now, "exception" if exception else None)
-            record.doubt.answered(turn.pdu[0])
-            self._heard(record, now)
-            if turn.purpose is Purpose.SETTLE:
-                record.heard(now)
-                if isinstance(self._held, PollItem):
-                    self._held = None  # it is due still, if it is still wanted
+            failed = "exception" if exception else None if error is None else error.label
+            seconds = self._accounting.ended(turn, sent_at, now, failed)
+            if error is not None:
+                record.doubt.missed(turn.pdu[0])
+                blameless = isinstance(event, Failed) and event.blameless and not record.breaker.is_open
+                if blameless and self._aside.again(turn):
+                    continue
+                self._on_no_reply(turn, record, error, now)
             else:
+                assert isinstance(event, Replied)
                 self._on_reply(turn, record, event, now)
-        if isinstance(turn, ReadTurn):
-            self._scheduler.charge(turn, now - self._sent_at)
-        self._judge(record, now)
+            self._aside.forget(turn)
+            if isinstance(turn, ReadTurn):
+                self._scheduler.charge(turn, seconds)
+            self._judge(record, now)
+        self._watch_window(now)
+
+    def _relayed(self, pdu: bytes) -> RequestError | None:
+        """What rule 11 makes of a reply."""
+        if not self._wire.relays or not is_exception(pdu) or pdu[1] not in _RELAYED:
+            return None
+        return _RELAYED[pdu[1]]("an upstream gateway says so")
+
+    def _on_no_reply(self, turn: Turn, record: DeviceRecord, error: RequestError, now: float) -> None:
+        if turn.purpose is Purpose.SETTLE:
+            self._on_unsettled(turn, record, error, now)
+        else:
+            self._on_failure(turn, record, error, now)
 
     def _on_reply(self, turn: Turn, record: DeviceRecord, event: Replied, now: float) -> None:
+        record.doubt.answered(turn.pdu[0])
+        self._heard(record, now)
+        if turn.purpose is Purpose.SETTLE:
+            record.heard(now)
+            self._aside.settled(turn)
+            return
         if isinstance(turn, PollItem):
             if is_exception(event.pdu):
                 self._polling.refused(turn, record, event.pdu[1], now)
@@ -344,7 +364,11 @@ class LineEngine:
             if not is_exception(event.pdu):
                 self._written(turn, record, now)
             self._finish([turn.waiter], event.pdu)
-        elif is_exception(event.pdu) and len(turn.reads) > 1:
+        else:
+            self._on_read(turn, record, event)
+
+    def _on_read(self, turn: ReadTurn, record: DeviceRecord, event: Replied) -> None:
+        if is_exception(event.pdu) and len(turn.reads) > 1:
             if turn.span is not None and event.pdu[1] in _REFUSALS:
                 record.polls.refused(turn.span.space, turn.span.count)
             for read in reversed(turn.reads):
@@ -355,12 +379,12 @@ class LineEngine:
             self._scheduler.retry(turn.reads[0])
         else:
             for read in turn.reads:
-                self._finish(read.waiters, _answer(turn, read, event.pdu))
+                self._finish(read.waiters, part_of(turn, read, event.pdu))
 
     def _on_failure(self, turn: Turn, record: DeviceRecord, error: RequestError, now: float) -> None:
-        silent = isinstance(error, ReplyTimeout)
+        silent = isinstance(error, ReplyTimeout) and not isinstance(error, RelayedNoPath)
         if isinstance(turn, WriteTurn):
-            point = _written_point(turn.device, turn.pdu)
+            point = written_point(turn.device, turn.pdu)
             if silent and point is not None and point.restarts:
                 self._written(turn, record, now)
                 record.restarting_until = now + RESTART_S
@@ -374,14 +398,15 @@ class LineEngine:
             self._finish([turn.waiter], error)
         else:
             for read in reversed(turn.reads):
-                if record.breaker.is_open or read.attempts > self.settings.retries or not read.wanted:
+                final = record.breaker.is_open or isinstance(error, RelayedSilence)
+                if final or read.attempts > self.settings.retries or not read.wanted:
                     self._finish(read.waiters, error)
                 else:
                     self._scheduler.retry(read)
 
-    def _on_unsettled(self, record: DeviceRecord, error: RequestError, now: float) -> None:
+    def _on_unsettled(self, question: Turn, record: DeviceRecord, error: RequestError, now: float) -> None:
         """The settling question failed, and with it the turn that was held for it (rule 7)."""
-        turn, self._held = self._held, None
+        turn = self._aside.unsettled(question)
         if turn is None:  # ended by rule 9
             return
         if isinstance(turn, WriteTurn):
@@ -398,14 +423,15 @@ class LineEngine:
         if not isinstance(error, ReplyTimeout):
             self._heard(record, now)  # it speaks, if not clearly
         elif now >= record.restarting_until and not optional:
-            record.breaker.missed(now)
+            no_path = isinstance(error, RelayedNoPath)  # asking costs the upstream's line nothing
+            record.breaker.missed(now, FIRST_PROBE_S if no_path else LAST_PROBE_S)
 
     def _puts_off(self, turn: ReadTurn, pdu: bytes) -> bool:
         return is_exception(pdu) and pdu[1] == _BUSY and self.settings.retries > 0 and not turn.reads[0].put_off
 
     def _watch_window(self, now: float) -> None:
         """Say when late replies made the quarantine longer, and when it is as configured again."""
-        window_s = self._rtu.quarantine_s(now)
+        window_s = self._wire.quarantine_s(now)
         if window_s > self._window_s:
             log.warning("event=late_replies line=%s quarantine_s=%g", self.settings.name, window_s)
         elif window_s < self._window_s and window_s <= self._calm_window_s:
@@ -417,7 +443,7 @@ class LineEngine:
         space = turn.device.map.write_functions[turn.pdu[0]]
         address = int.from_bytes(turn.pdu[1:3], "big")
         self._polling.wanted_again(record, space, address, now)
-        point = _written_point(turn.device, turn.pdu)
+        point = written_point(turn.device, turn.pdu)
         if point is None or point.rewrite_s is None:
             return
         held = point.released.held_by(int.from_bytes(turn.pdu[3:5], "big"), held=point.name in record.rewrites)
@@ -466,37 +492,3 @@ class LineEngine:
             self._state_since = now
         self._state = state
         self._error = error
-
-
-def _wanted(turn: Turn) -> bool:
-    """Whether anybody still waits for it."""
-    if isinstance(turn, ReadTurn):
-        return any(read.wanted for read in turn.reads)
-    return not (isinstance(turn, WriteTurn) and turn.waiter.left)
-
-
-def _waiters(turn: Turn) -> list[Waiter]:
-    if isinstance(turn, ReadTurn):
-        return [waiter for read in turn.reads for waiter in read.waiters]
-    return [turn.waiter] if isinstance(turn, WriteTurn) else []
-
-
-def _answer(turn: ReadTurn, read: ClientRead, reply: bytes) -> bytes:
-    """The read's own part of a turn's reply."""
-    if len(turn.reads) == 1 or turn.span is None or read.span is None:
-        return reply
-    return part(reply, turn.span, read.span)
-
-
-def _span(device: Device, pdu: bytes) -> Span | None:
-    """What a read asks for; None for identification. Raises the RequestError that refuses anything else."""
-    if pdu and pdu[0] in _READS and pdu[0] in device.map.functions:
-        return Span.of(device, parse_read(pdu))
-    if pdu and pdu[0] == Function.READ_IDENTIFICATION:
-        return None
-    raise IllegalFunction("only reads are sent")
-
-
-def _written_point(device: Device, pdu: bytes) -> Point | None:
-    space = device.map.write_functions.get(pdu[0])
-    return None if space is None else device.map.writable_point(space, int.from_bytes(pdu[1:3], "big"))

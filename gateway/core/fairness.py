@@ -14,6 +14,7 @@ A client is named by whoever asks (the TCP face: by its address); at most `MAX_C
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from gateway.core.requests import ClientRead, Lane, Span, Waiter
@@ -84,22 +85,25 @@ class FairQueue:
         for client in read.clients():
             self._enqueue(client, read, first=True)
 
-    def head(self) -> ClientRead | None:
-        """The read whose turn it is (rules 1 and 3), or None."""
+    def head(self, ready: Callable[[Device], bool] = lambda _device: True) -> ClientRead | None:
+        """The read whose turn it is (rules 1 and 3) among those whose device is `ready`, or None."""
         best: tuple[float, float, str] | None = None
+        best_read: ClientRead | None = None
         for client, share in list(self._shares.items()):
             self._prune(share)
             if not share.reads:
                 if share.used_s <= self._level_s or len(self._shares) > MAX_CLIENTS:
                     del self._shares[client]
                 continue
-            rank = (share.used_s, share.reads[0].queued_at, client)
+            read = next((r for r in share.reads if not r.started and r.wanted and ready(r.device)), None)
+            if read is None:
+                continue
+            rank = (share.used_s, read.queued_at, client)
             if best is None or rank < best:
-                best = rank
-        if best is None:
-            return None
-        self._level_s = max(self._level_s, best[0])
-        return self._shares[best[2]].reads[0]
+                best, best_read = rank, read
+        if best is not None:
+            self._level_s = max(self._level_s, best[0])
+        return best_read
 
     def of_device(self, device: Device) -> list[ClientRead]:
         """All wanted reads that wait for one device, oldest first."""

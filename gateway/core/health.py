@@ -37,13 +37,13 @@ class Breaker:
         self.probe_at = None
         self._wait_s = FIRST_PROBE_S
 
-    def missed(self, now: float) -> None:
-        """An attempt ended without any reply (rules 1 and 2)."""
+    def missed(self, now: float, longest_s: float = LAST_PROBE_S) -> None:
+        """An attempt ended without any reply (rules 1 and 2); the next probe waits `longest_s` at most."""
         self.misses += 1
         if self.misses < MISSES_TO_OPEN:
             return
         if self.probe_at is not None:
-            self._wait_s = min(2 * self._wait_s, LAST_PROBE_S)
+            self._wait_s = min(2 * self._wait_s, longest_s)
         self.probe_at = now + self._wait_s * (1 - JITTER * self._rng.random())
 
     def line_opened(self, now: float) -> None:

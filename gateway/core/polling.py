@@ -29,7 +29,7 @@ from gateway.devices.model import Identification, PollClass, Space
 from gateway.devices.plan import PlannedBlock, poll_plan, split
 from gateway.devices.texts import decode_text
 from gateway.modbus.pdu import Function, ReadRequest, parse_identification, read_identification_request
-from gateway.modbus.rtu import Replied
+from gateway.modbus.transactions import Replied
 
 log = logging.getLogger(__name__)
 
@@ -111,14 +111,14 @@ class Polling:
             item.fresh = True
             record.store(Block(block.space, block.first, block.count, event.pdu[2:], event.sent_at), now)
         elif item.purpose is Purpose.IDENTIFY:
-            record.polls.items.remove(item)
+            record.polls.drop(item)
             objects = parse_identification(event.pdu).objects
             texts = (objects.get(number, b"").decode("ascii", "replace").strip("\0 ") for number in range(3))
             identification = Identification(*texts)
             record.identified(identification, now)
             self._keep_what_it_has(record, identification.product)
         else:
-            record.polls.items.remove(item)
+            record.polls.drop(item)
             record.numbered(decode_text("ascii", event.pdu[2:], item.device.map.identity.serial_order), now)
 
     def refused(self, item: PollItem, record: DeviceRecord, code: int, now: float) -> None:
@@ -126,7 +126,7 @@ class Polling:
         record.heard(now)
         block = item.block
         if block is None:
-            record.polls.items.remove(item)  # the device does not have it: asked once, no failure
+            record.polls.drop(item)  # the device does not have it: asked once, no failure
             return
         item.misses += 1
         item.device.stats.failures += 1
@@ -154,7 +154,7 @@ class Polling:
         if item.period_s is None:
             item.due = now + self._settings.poll.live_s
             if item.misses >= MISSES_TO_OPEN or item.optional:
-                record.polls.items.remove(item)  # tried, never insisted on
+                record.polls.drop(item)  # tried, never insisted on
 
     def wanted_again(self, record: DeviceRecord, space: Space, address: int, now: float) -> None:
         """An address was written: its old value is forgotten and its block is read next."""

@@ -125,6 +125,7 @@ class ReadTurn:
     pdu: bytes
     span: Span | None
     reads: tuple[ClientRead, ...]
+    again: bool = False  # it ended through no fault of its own and is made once more
 
     @property
     def purpose(self) -> Purpose:
@@ -161,6 +162,8 @@ class PollItem:
     misses: int = 0  # attempts in a row that gave no data
     fresh: bool = False  # whether it gave data since the line was opened or the device came back
     early_at: float = -math.inf  # when it was last brought forward
+    under_way: bool = False
+    again: bool = False  # as of `ReadTurn`
 
     @property
     def optional(self) -> bool:

@@ -12,6 +12,8 @@ Rule 5: background reads go only when nothing else is to be done and they are ov
         long they wait. So that idle time which lies in pieces between the polls is of use, a background read that has
         waited for GATHER_S brings polls forward, each at most once in GATHER_S: then they follow one another.
 Rule 6: client reads share the line fairly (fairness.py) and are joined where that saves line time (coalescing.py).
+Rule 7: where a line carries several transactions at once, nothing is begun that must wait for one under way
+        (under_way.py). A write that waits for its device lets no further read of that device begin.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from gateway.core.fairness import FairQueue
 from gateway.core.health import Breaker
 from gateway.core.requests import ClientRead, Lane, PollItem, Purpose, ReadTurn, Span, Turn, Waiter, WriteTurn
 from gateway.core.site import Device
+from gateway.core.under_way import UnderWay
 from gateway.devices.model import Space
 from gateway.devices.plan import limit as protocol_limit
 from gateway.errors import QueueFull
@@ -47,14 +50,20 @@ class PollList:
     most: dict[Space, int] = field(default_factory=dict)  # space → the longest read not yet refused
 
     def first(self) -> tuple[float, PollItem] | None:
-        """The poll that is due first and when (rule 4); None when the device has none."""
-        if not self.items:
+        """The poll that is due first and when (rule 4); None when the device has none that is not under way."""
+        items = [item for item in self.items if not item.under_way]
+        if not items:
             return None
         if self.breaker.probe_at is not None:
-            probe = next((item for item in self.items if item.purpose is Purpose.POLL), self.items[0])
+            probe = next((item for item in items if item.purpose is Purpose.POLL), items[0])
             return self.breaker.probe_at, probe
-        item = min(self.items, key=lambda item: item.due)
+        item = min(items, key=lambda item: item.due)
         return item.due, item
+
+    def drop(self, item: PollItem) -> None:
+        """It is not asked any more; when the device was restarted while it was under way, it is gone already."""
+        if item in self.items:
+            self.items.remove(item)
 
     def most_in(self, space: Space) -> int:
         """The longest read of this space that makes sense."""
@@ -68,7 +77,17 @@ class PollList:
 class Scheduler:
     """The queues of one line."""
 
-    def __init__(self, polls: Iterable[PollList], *, limit: int, limit_s: float, cost: Cost, now: float) -> None:
+    def __init__(
+        self,
+        polls: Iterable[PollList],
+        *,
+        limit: int,
+        limit_s: float,
+        cost: Cost,
+        now: float,
+        under_way: UnderWay | None = None,
+    ) -> None:
+        self._under_way = under_way if under_way is not None else UnderWay()
         self._polls = {list_.device.unit_id: list_ for list_ in polls}
         self._limit = limit
         self._cost = cost
@@ -126,10 +145,10 @@ class Scheduler:
 
     def next_due(self, now: float) -> float | None:
         """When there is something to do; `now` or earlier: at once. None: never."""
-        if any(self._write_head(lane) for lane in self._writes) or self._clients.head() is not None:
+        if any(self._write_head(lane) for lane in self._writes) or self._clients.head(self._ready) is not None:
             return now
         due = self._next_poll_due()
-        background = self._background.head()
+        background = self._background.head(self._ready)
         if background is None or (due is not None and due <= now):
             return due
         if self._fits(background, now) or self._early(background, now) is not None:
@@ -144,7 +163,7 @@ class Scheduler:
             write = self._write_head(lane)
             if write is not None:
                 ready[lane] = write.queued_at + PATIENCE_S[lane]
-        client = self._clients.head()
+        client = self._clients.head(self._ready)
         if client is not None:
             ready[Lane.CLIENT] = max(client.queued_at, self._served_at[Lane.CLIENT]) + PATIENCE_S[Lane.CLIENT]
         poll = self._due_poll(now)
@@ -155,7 +174,10 @@ class Scheduler:
         lane = self._choose(ready, now, poll_grace_s=(poll[1].period_s or 0.0) if poll is not None else 0.0)
         self._served_at[lane] = now
         if lane in self._writes:
-            return self._writes[lane].popleft()
+            write = self._write_head(lane)
+            assert write is not None
+            self._writes[lane].remove(write)
+            return write
         if lane is Lane.POLL:
             assert poll is not None
             return poll[1]
@@ -164,7 +186,7 @@ class Scheduler:
 
     def _when_idle(self, now: float) -> Turn | None:
         """Rule 5."""
-        background = self._background.head()
+        background = self._background.head(self._ready)
         if background is None:
             return None
         if self._fits(background, now):
@@ -209,7 +231,14 @@ class Scheduler:
         queue = self._writes[lane]
         while queue and queue[0].waiter.left:
             queue.popleft()
-        return queue[0] if queue else None
+        return next((w for w in queue if not w.waiter.left and self._under_way.idle(w.device)), None)
+
+    def _ready(self, device: Device) -> bool:
+        """Whether a read of the device may begin (rule 7)."""
+        if self._under_way.idle(device):
+            return True
+        writes = (write for queue in self._writes.values() for write in queue)
+        return self._under_way.open(device) and not any(w.device is device and not w.waiter.left for w in writes)
 
     def _read_s(self, read: ClientRead) -> float:
         return self._cost(Space.REGISTERS, 3) if read.span is None else self._cost(read.span.space, read.span.count)
@@ -225,7 +254,8 @@ class Scheduler:
         """The poll to bring forward for a background read that does not fit (rule 5)."""
         if now < self._gather_at(background):
             return None
-        firsts = [polls.first() for polls in self._polls.values() if polls.breaker.probe_at is None]
+        lists = [polls for polls in self._polls.values() if polls.breaker.probe_at is None and self._ready(polls.device)]
+        firsts = [polls.first() for polls in lists]
         in_the_way = [
             (due, item)
             for due, item in (first for first in firsts if first is not None)
@@ -234,12 +264,13 @@ class Scheduler:
         return min(in_the_way, key=itemgetter(0))[1] if in_the_way else None
 
     def _next_poll_due(self) -> float | None:
-        return min((first[0] for polls in self._polls.values() if (first := polls.first()) is not None), default=None)
+        firsts = (polls.first() for polls in self._polls.values() if self._ready(polls.device))
+        return min((first[0] for first in firsts if first is not None), default=None)
 
     def _due_poll(self, now: float) -> tuple[float, PollItem] | None:
         best: tuple[float, PollItem] | None = None
         for polls in self._polls.values():
-            first = polls.first()
+            first = polls.first() if self._ready(polls.device) else None
             if first is not None and first[0] <= now and (best is None or first[0] < best[0]):
                 best = first
         return best

@@ -17,8 +17,18 @@ class PollSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class UpstreamSettings:
+    """Where a Modbus TCP upstream is, and how it is used."""
+
+    host: str
+    port: int
+    pipelining: int = 8  # how many requests may be under way at once; fewer where the server does not stand it
+    connect_timeout_s: float = 3.0
+
+
+@dataclass(frozen=True, slots=True)
 class LineSettings:
-    """One serial line."""
+    """One line: a serial port, or a Modbus TCP upstream, which has no use for the settings of a port."""
 
     name: str
     index: int  # 1-based position in the configuration; the MIB's lineIndex
@@ -35,6 +45,7 @@ class LineSettings:
     queue_limit_s: float = 5.0  # a client read that waited longer is answered 06
     writes: bool = False  # whether this line ever sends a write
     poll: PollSettings = PollSettings()
+    upstream: UpstreamSettings | None = None  # None: a serial port
 
     def same_wire(self, other: LineSettings) -> bool:
         """Whether a line that runs by these can go on by the others without its port being opened anew."""

@@ -9,12 +9,12 @@ from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 
 from gateway.core.histogram import Histogram
-from gateway.modbus.counters import RtuCounters
+from gateway.modbus.counters import RtuCounters, UpstreamCounters
 
 
 @dataclass(slots=True)
 class LineStats:
-    """What a line did since start. `sent` = `ok` + the sum of `failed` + the one on the wire."""
+    """What a line did since start. `sent` = `ok` + the sum of `failed` + those under way."""
 
     sent: int = 0
     ok: int = 0
@@ -31,6 +31,7 @@ class LineStats:
     queue_wait: Histogram = field(default_factory=Histogram)  # of client reads and writes
     reply_time: Histogram = field(default_factory=Histogram)  # request out to reply whole
     wire: RtuCounters = field(default_factory=RtuCounters)
+    upstream: UpstreamCounters | None = None  # of a Modbus TCP upstream only
 
 
 @dataclass(slots=True)

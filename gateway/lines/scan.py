@@ -23,7 +23,8 @@ from gateway.devices.texts import decode_text
 from gateway.errors import PortError, ReplyCrcError, ReplyMismatch, RequestError
 from gateway.modbus.counters import RtuCounters
 from gateway.modbus.pdu import Function, ReadRequest, is_exception, parse_identification, read_identification_request
-from gateway.modbus.rtu import Failed, Replied, RtuClient, Timing
+from gateway.modbus.rtu import RtuClient, Timing
+from gateway.modbus.transactions import Failed, Replied
 
 LOOK_S = 0.02
 """How long one look at the port takes; changing it would set up the port anew each time."""

@@ -58,6 +58,11 @@ class MbapSplitter:
         """Bytes kept of an unfinished ADU; at most 259."""
         return len(self._buffer)
 
+    def begins(self, tid: int) -> bool:
+        """Whether the unfinished ADU, as far as it is there, can be one with this transaction id."""
+        head = _PREFIX.pack(tid, 0, 0)[:5]  # no ADU is so long that the length's first byte is not 0
+        return head.startswith(self._buffer[: len(head)])
+
     def feed(self, data: bytes) -> list[Adu]:
         """Take received bytes and return the ADUs that they complete, in order."""
         if self.lost is not None:

@@ -39,6 +39,7 @@ from gateway.modbus.collector import Collector, Echo
 from gateway.modbus.counters import RtuCounters
 from gateway.modbus.frames import Exchange, Survey
 from gateway.modbus.quarantine import QuarantineWindow
+from gateway.modbus.transactions import Failed, Replied
 
 ADAPTER_HOLD_S = 0.02
 """USB adapters hand bytes over in batches of up to 16 ms; a longer pause is the line's."""
@@ -68,24 +69,6 @@ class Timing:
     def wire_s(self, n_bytes: int) -> float:
         """Seconds that `n_bytes` take on the wire."""
         return n_bytes * self.char_s
-
-
-@dataclass(frozen=True, slots=True)
-class Replied:
-    """The request was answered; `pdu` may be the device's exception."""
-
-    pdu: bytes
-    sent_at: float
-    received_at: float
-
-
-@dataclass(frozen=True, slots=True)
-class Failed:
-    """The request ended without an answer: ReplyTimeout, ReplyCrcError or ReplyMismatch."""
-
-    error: RequestError
-    sent_at: float
-    at: float
 
 
 @dataclass(slots=True)

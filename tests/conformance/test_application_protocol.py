@@ -24,7 +24,8 @@ from gateway.modbus.pdu import (
     read_identification_request,
     reply_fits,
 )
-from gateway.modbus.rtu import Replied, RtuClient, Timing
+from gateway.modbus.rtu import RtuClient, Timing
+from gateway.modbus.transactions import Replied
 
 
 @dataclass(frozen=True)

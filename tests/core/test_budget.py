@@ -13,6 +13,7 @@ from gateway.devices.model import Space
 from gateway.devices.schema import load_map
 from gateway.errors import ReplyTimeout
 from gateway.modbus.pdu import Function, ReadRequest
+from gateway.modbus.rtu_wire import RtuWire
 from tests.core.test_engine import Registers
 from tests.core.virtual_line import MakeLine
 
@@ -65,8 +66,9 @@ def test_every_read_ends_within_the_printed_deadline(virtual_line: MakeLine, str
         controller.silent = True
     line = virtual_line(*dead, retries=2, queue_limit=64)
     for _ in range(stragglers):
-        line.engine._rtu._window.straggler(line.now)
-    assert line.engine._rtu.quarantine_s(line.now) == (2.0 if stragglers else 0.1)
+        assert isinstance(line.engine._wire, RtuWire)
+        line.engine._wire.client._window.straggler(line.now)
+    assert line.engine._wire.quarantine_s(line.now) == (2.0 if stragglers else 0.1)
     ended: list[tuple[float, Outcome]] = []
 
     def done(outcome: Outcome) -> None:

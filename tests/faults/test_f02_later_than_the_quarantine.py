@@ -20,7 +20,7 @@ def miss(line: Rig, late_s: float) -> None:
 
 
 def window_s(line: Rig) -> float:
-    return line.engine._rtu.quarantine_s(line.now)
+    return line.engine._wire.quarantine_s(line.now)
 
 
 def test_the_polled_blocks_of_a_device_have_unequal_lengths() -> None:

@@ -72,7 +72,7 @@ def watch(hours: int, live_s: float) -> None:
         stats = rig.engine.stats
         assert [rig.state(n) for n in range(3)] == [DeviceState.ONLINE] * 3
         assert stats.sent > 2 * 3 * hours * HOUR_S / live_s * 0.9
-        assert stats.sent == stats.ok + stats.failed.total() + (rig.engine._turn is not None)
+        assert stats.sent == stats.ok + stats.failed.total() + (len(rig.engine._under_way))
         assert set(rig.verdicts) == {Verdict.RIGHT}
         assert rig.verdicts.total() > 0.9 * stats.ok
         assert len(chaos.counts) >= (len(Fault) if hours > 4 else 10)

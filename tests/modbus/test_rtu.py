@@ -11,7 +11,8 @@ from gateway.modbus.collector import Echo
 from gateway.modbus.counters import RtuCounters
 from gateway.modbus.crc import append_crc
 from gateway.modbus.pdu import read_identification_request
-from gateway.modbus.rtu import Failed, Replied, RtuClient, State, Timing
+from gateway.modbus.rtu import RtuClient, State, Timing
+from gateway.modbus.transactions import Failed, Replied
 from tests.modbus.virtual_line import TIMING, read, registers
 
 REPLY = registers(1, 2)

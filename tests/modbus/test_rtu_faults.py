@@ -10,7 +10,8 @@ from gateway.errors import ReplyCrcError, ReplyMismatch, ReplyTimeout
 from gateway.modbus.collector import Echo
 from gateway.modbus.crc import append_crc
 from gateway.modbus.pdu import read_identification_request
-from gateway.modbus.rtu import Failed, Replied, State
+from gateway.modbus.rtu import State
+from gateway.modbus.transactions import Failed, Replied
 from tests.modbus.virtual_line import QUARANTINE_S, TIMEOUT_S, TIMING, VirtualLine, pdus, read, registers
 
 TURNAROUND_S = 0.02

@@ -13,7 +13,8 @@ from gateway.modbus.counters import RtuCounters
 from gateway.modbus.crc import append_crc, crc_ok
 from gateway.modbus.frames import Exchange
 from gateway.modbus.pdu import ReadRequest, read_identification_request, reply_fits
-from gateway.modbus.rtu import Replied, RtuClient, State
+from gateway.modbus.rtu import RtuClient, State
+from gateway.modbus.transactions import Replied
 from tests.modbus.virtual_line import TIMING, Event, pdus
 
 LABELS = {"timeout", "crc", "mismatch"}

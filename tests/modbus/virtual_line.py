@@ -10,7 +10,8 @@ from enum import Enum
 from gateway.modbus.counters import RtuCounters
 from gateway.modbus.crc import append_crc
 from gateway.modbus.pdu import ReadRequest
-from gateway.modbus.rtu import Failed, Replied, RtuClient, State, Timing
+from gateway.modbus.rtu import RtuClient, State, Timing
+from gateway.modbus.transactions import Failed, Replied
 
 TIMING = Timing.of(9600, 8, "N", 2)
 QUARANTINE_S = 0.1
