@@ -59,8 +59,8 @@ def _lines(config: Config, budgets: Sequence[LineBudget]) -> Table:
     for heading in ("devices", "use", "reply deadline"):
         table.add_column(heading, justify="right", no_wrap=True)
     for line, budget in zip(config.line, budgets, strict=True):
-        style = "red" if budget.use_ratio > 1 else ""
-        use = f"{budget.use_ratio:.0%}"
+        style = "red" if budget.use_ratio is not None and budget.use_ratio > 1 else ""
+        use = "–" if budget.use_ratio is None else f"{budget.use_ratio:.0%}"
         deadline = f"{budget.reply_deadline_s:.1f} s"
         table.add_row(escape(line.name), escape(line.port), str(len(line.device)), use, deadline, style=style)
     return table

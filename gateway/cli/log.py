@@ -26,6 +26,7 @@ from gateway.errors import HistoryError
 from gateway.history.columns import Column, columns
 from gateway.history.export import export, rows_to_read, timestamp
 from gateway.history.reader import HistoryReader, StoredDay
+from gateway.service.settings import line_sites
 
 BAR_AFTER_S = 1.0
 WIDE = 104
@@ -61,7 +62,7 @@ def command(
     selection = Selection(device, _moment(since, "--since"), _moment(until, "--until", end=True))
     checked = load_or_exit(config)
     try:
-        with HistoryReader(Path(checked.state_dir)) as reader:
+        with HistoryReader(Path(checked.state_dir), line_sites(checked)) as reader:
             known = reader.devices() | {table.name for line in checked.line for table in line.device}
             if device is not None and device not in known:
                 names = ", ".join(sorted(known))

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from gateway.core.settings import LineSettings
+from gateway.core.settings import LineSettings, UpstreamSettings
 from gateway.devices.model import DeviceMap, PollClass, Space
 from gateway.devices.plan import poll_plan
 from gateway.modbus.quarantine import MAX_WINDOW_S
@@ -20,15 +20,20 @@ REQUEST_BYTES = 8
 REPLY_OVERHEAD_BYTES = 5
 LONGEST_FRAME_BYTES = 256
 UPSTREAM_BYTE_S = 1e-5
+GRACE_S = 1.0
+"""How long an upstream's line stays open without a connection."""
 WATCH_S = 1.0
 """A face looks so often for requests that nobody has answered."""
 
 
 @dataclass(frozen=True, slots=True)
 class LineBudget:
-    """Projection for one line. `use_ratio` over 1 means that periods stretch by that factor."""
+    """Projection for one line. `use_ratio` over 1 means that periods stretch by that factor.
 
-    use_ratio: float
+    What an upstream carries is not known beforehand: its `use_ratio` is None and the refresh times are those asked for.
+    """
+
+    use_ratio: float | None
     live_refresh_s: float  # how often each device's live values will be read
     settings_refresh_s: float
     reply_deadline_s: float  # a Modbus TCP client has its answer by then, or its connection is closed
@@ -39,6 +44,8 @@ def line_budget(settings: LineSettings, maps: Sequence[DeviceMap], *, timeouts_s
 
     `timeouts_s` are the time-outs of the devices that have one of their own.
     """
+    if settings.upstream is not None:
+        return _upstream_budget(settings, settings.upstream, timeouts_s)
     timing = settings.timing()
     period_s = {PollClass.LIVE: settings.poll.live_s, PollClass.SETTINGS: settings.poll.settings_s}
     use = sum(
@@ -60,6 +67,20 @@ def line_budget(settings: LineSettings, maps: Sequence[DeviceMap], *, timeouts_s
         settings_refresh_s=settings.poll.settings_s * stretch,
         # One transaction may be under way when the queue time ends; before each try there may be a settling question.
         reply_deadline_s=settings.queue_limit_s + (2 * (settings.retries + 1) + 1) * attempt_s + WATCH_S,
+    )
+
+
+def _upstream_budget(settings: LineSettings, upstream: UpstreamSettings, timeouts_s: Sequence[float]) -> LineBudget:
+    timeout_s = max((settings.reply_timeout_s, *timeouts_s))
+    # A try that fails in company waits for another that is made again alone, then is made again itself
+    # (core/set_aside.py); before it there may be a settling question, and a new connection.
+    attempt_s = 4 * timeout_s + min(upstream.connect_timeout_s, GRACE_S)
+    return LineBudget(
+        use_ratio=None,
+        live_refresh_s=settings.poll.live_s,
+        settings_refresh_s=settings.poll.settings_s,
+        # As many tries, and whatever was under way when the queue time ended.
+        reply_deadline_s=settings.queue_limit_s + (settings.retries + 2) * attempt_s + WATCH_S,
     )
 
 

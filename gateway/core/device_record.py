@@ -7,6 +7,7 @@ tells its own may come from another read; when it turns out to be another one, e
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -41,6 +42,8 @@ class DeviceRecord:
         self.known = device.expected
         self.verified = False  # since the line was opened or the device came back
         self.restarting_until = 0.0  # a restart was commanded: its silence means nothing
+        self.asked_at = now  # when the request went out whose end was looked at last
+        self.missed_at = -math.inf  # when a missed reply was last counted
         self.rewrites: dict[str, float] = {}  # point that must be written again and again → last written
         self.live_started_at: float | None = None
         self.doubt = Doubt()

@@ -248,7 +248,7 @@ class LineEngine:
             self._finish(waiters_of(turn), error)
             return self.step(now)
         record = self._records[turn.device.unit_id]
-        self._under_way.add(key, turn, now, closed=record.breaker.is_open, alone=self._aside.is_again(turn))
+        self._under_way.add(key, turn, now, closed=record.breaker.is_open, alone=self._aside.is_alone(turn))
         self._aside.begun(turn)
         self._begun(turn, now)
         self._accounting.sent(turn, now)
@@ -314,6 +314,7 @@ class LineEngine:
         for key, event in ended:
             turn, sent_at = self._under_way.end(key)
             record = self._records[turn.device.unit_id]
+            record.asked_at = sent_at
             error = event.error if isinstance(event, Failed) else self._relayed(event.pdu)
             exception = isinstance(event, Replied) and is_exception(event.pdu)
             turn.device.stats.exceptions += exception
@@ -422,7 +423,13 @@ class LineEngine:
         record.device.stats.failures += 1
         if not isinstance(error, ReplyTimeout):
             self._heard(record, now)  # it speaks, if not clearly
-        elif now >= record.restarting_until and not optional:
+        elif (
+            now >= record.restarting_until
+            and not optional
+            and not self._wire.silent
+            and (record.asked_at >= record.missed_at)
+        ):
+            record.missed_at = now  # what was under way together counts once
             no_path = isinstance(error, RelayedNoPath)  # asking costs the upstream's line nothing
             record.breaker.missed(now, FIRST_PROBE_S if no_path else LAST_PROBE_S)
 

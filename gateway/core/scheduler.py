@@ -254,7 +254,9 @@ class Scheduler:
         """The poll to bring forward for a background read that does not fit (rule 5)."""
         if now < self._gather_at(background):
             return None
-        lists = [polls for polls in self._polls.values() if polls.breaker.probe_at is None and self._ready(polls.device)]
+        lists = [
+            polls for polls in self._polls.values() if polls.breaker.probe_at is None and self._ready(polls.device)
+        ]
         firsts = [polls.first() for polls in lists]
         in_the_way = [
             (due, item)

@@ -2,8 +2,9 @@
 
 Rule 1: a turn whose device must first answer the question that settles its missed replies (doubt.py) is held. It goes
         on when that was answered; a poll is let go instead, for it is due still, if it is still wanted.
-Rule 2: a turn that ended through no fault of its own is made again, once, with the line to itself: nothing else begins
-        before it has ended. So whoever is to blame shows, and a server that does not stand company is found out.
+Rule 2: turns that ended through no fault of their own are made again, once, before anything else. The first of them
+        has the line to itself: nothing else begins before it has ended. So a server that does not stand company is
+        found out, and when it is one device's silence that took the others with it, that shows too.
 """
 
 from __future__ import annotations
@@ -22,14 +23,15 @@ class SetAside:
         self._under_way = under_way
         self._held: dict[int, Turn] = {}  # by unit id
         self._again: deque[Turn] = deque()
+        self._alone: Turn | None = None  # the first of them
 
-    def is_again(self, turn: Turn) -> bool:
-        """Whether it is made again (rule 2)."""
-        return turn in self._again
+    def is_alone(self, turn: Turn) -> bool:
+        """Whether the line must be its own (rule 2)."""
+        return turn is self._alone
 
     def blocks(self) -> bool:
         """Whether nothing may begin now: rule 2."""
-        return self._under_way.alone or bool(self._again and self._under_way)
+        return self._under_way.alone or (self._alone is not None and bool(self._under_way))
 
     def due(self) -> bool:
         """Whether there is something that could begin now."""
@@ -77,6 +79,8 @@ class SetAside:
         if isinstance(turn, WriteTurn) or turn.again:
             return False
         turn.again = True
+        if not self._again:
+            self._alone = turn
         self._again.append(turn)
         if isinstance(turn, ReadTurn):
             for read in turn.reads:
@@ -87,6 +91,8 @@ class SetAside:
         """It went out."""
         if turn in self._again:
             self._again.remove(turn)
+        if turn is self._alone:
+            self._alone = None
 
     def forget(self, turn: Turn) -> None:
         """It has ended, or nobody wants it any more; a poll will be made again as if for the first time."""

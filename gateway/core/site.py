@@ -124,13 +124,20 @@ class Site:
     lines: tuple[LinePort, ...]
     devices: tuple[Device, ...]  # ascending unit id
     by_unit: Mapping[int, Device]
+    behind: Mapping[str, str] = field(default_factory=dict)  # line → the site that is behind it, where it is another
 
     @classmethod
-    def of(cls, name: str, lines: Sequence[LinePort], devices: Sequence[Device]) -> Site:
+    def of(
+        cls, name: str, lines: Sequence[LinePort], devices: Sequence[Device], behind: Mapping[str, str] | None = None
+    ) -> Site:
         """Build the site; ValueError when two devices have one unit id."""
         by_unit = {device.unit_id: device for device in devices}
         if len(by_unit) != len(devices):
             message = "unit ids are not unique"
             raise ValueError(message)
         ordered = tuple(sorted(devices, key=lambda device: device.unit_id))
-        return cls(name, tuple(lines), ordered, MappingProxyType(by_unit))
+        return cls(name, tuple(lines), ordered, MappingProxyType(by_unit), MappingProxyType(dict(behind or {})))
+
+    def of_line(self, line: str) -> str:
+        """The name of the site that a line and its devices belong to."""
+        return self.behind.get(line, self.name)

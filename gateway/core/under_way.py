@@ -4,7 +4,7 @@ Rule 1: a serial line has one of them, a Modbus TCP upstream as many as its serv
 Rule 2: a write is alone with its device: it goes out when nothing of the device is under way, and nothing is asked of
         the device until it has ended. So no read that overlaps with it can bring back the old value as a new one.
 Rule 3: so is the question after a missed reply, and whatever is asked of a quarantined device.
-Rule 4: a turn that is made again because of its company (`alone`) has the whole line to itself.
+Rule 4: a turn that is made again to see what its company was to it (`alone`) has the whole line to itself.
 """
 
 from __future__ import annotations

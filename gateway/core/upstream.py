@@ -38,6 +38,11 @@ class UpstreamEngine(LineEngine):
         """Why the connection must be ended now (rule 2), "" when nothing is wrong with it; None: it may stay."""
         return self._tcp.drop
 
+    @property
+    def silent(self) -> bool:
+        """Whether the server answers nobody: the shell closes the line and tries later."""
+        return self._tcp.silent
+
     def opened(self, now: float) -> None:
         """There is a connection, after a time without."""
         super().opened(now)

@@ -78,7 +78,7 @@ def day_object(day: StoredDay, of_model: tuple[Column, ...], site: str) -> dict[
 
 
 def _owner(owner: Owner, site: str) -> dict[str, object]:
-    values = (site, owner.line, owner.device, owner.unit_id, owner.model, owner.identity)
+    values = (owner.site or site, owner.line, owner.device, owner.unit_id, owner.model, owner.identity)
     return dict(zip(_HEAD, values, strict=True))
 
 

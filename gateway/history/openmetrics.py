@@ -137,7 +137,7 @@ def _number(day: StoredDay, field: LogField | None) -> Value | None:
 
 
 def _labels(owner: Owner, site: str) -> str:
-    values = (owner.device, owner.line, owner.model, site, str(owner.unit_id), owner.identity)
+    values = (owner.device, owner.line, owner.model, owner.site or site, str(owner.unit_id), owner.identity)
     return ",".join(f'{name}="{_escaped(value)}"' for name, value in zip(LABELS, values, strict=True))
 
 

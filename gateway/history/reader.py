@@ -7,11 +7,11 @@ an estimate: where two would not, the later day is put a second after the earlie
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from gateway.core.daylog import LoggedDay, Selection
 from gateway.devices.model import Value
@@ -31,6 +31,7 @@ class Owner:
     line: str
     device: str
     unit_id: int
+    site: str | None = None  # where its line leads to another site than the history's
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +62,9 @@ class StoredApart:
 class HistoryReader:
     """The history in one directory; HistoryError when it cannot be opened or read. Closes as a context manager."""
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, behind: Mapping[str, str] | None = None) -> None:
+        """`behind`: lines behind which there is another site, and its name."""
+        self._behind = behind or {}
         self._path = directory / FILE_NAME
         self._db = open_for_reading(directory)
 
@@ -110,7 +113,7 @@ class HistoryReader:
             )
             while rows := cursor.fetchmany(_BATCH):
                 for *who, hourmeter, slot, words, fields, harvested, written, error_s in rows:
-                    owner = Owner(*who)
+                    owner = self._owner(who)
                     at = written
                     if at is not None:
                         if last is not None and last[0] == owner and at <= last[1]:
@@ -130,6 +133,10 @@ class HistoryReader:
             found = [LoggedDay(hours, json.loads(fields), written, error_s) for hours, fields, written, error_s in rows]
         return found[::-1]
 
+    def _owner(self, row: Sequence[Any]) -> Owner:
+        owner = Owner(*row)
+        return replace(owner, site=self._behind[owner.line]) if owner.line in self._behind else owner
+
     def apart(self, selection: Selection) -> Iterator[StoredApart]:
         """The blocks kept apart of the devices selected; they have no date."""
         with explained(self._path):
@@ -139,7 +146,7 @@ class HistoryReader:
                 (selection.device,),
             )
             for *who, hourmeter, slot, words, why in rows:
-                yield StoredApart(Owner(*who), hourmeter, slot, bytes(words), why)
+                yield StoredApart(self._owner(who), hourmeter, slot, bytes(words), why)
 
 
 def _where(selection: Selection) -> tuple[str, tuple[object, ...]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Sequence
+from collections.abc import AsyncGenerator, Mapping, Sequence
 from pathlib import Path
 
 from gateway.core.daylog import LogFormat, LoggedDay, Selection
@@ -14,8 +14,10 @@ from gateway.history.reader import HistoryReader
 class HistorySource:
     """Satisfies `core.daylog.DayLog` and `RecentDays` for the history in one directory."""
 
-    def __init__(self, directory: Path, site: str) -> None:
+    def __init__(self, directory: Path, site: str, behind: Mapping[str, str] | None = None) -> None:
+        """`behind`: lines behind which there is another site, and its name."""
         self._directory = directory
+        self._behind = behind
         self._site = site
 
     async def devices(self) -> frozenset[str]:
@@ -28,7 +30,7 @@ class HistorySource:
 
     async def export(self, form: LogFormat, selection: Selection) -> AsyncGenerator[bytes, None]:
         """See `DayLog.export`."""
-        reader = await asyncio.to_thread(HistoryReader, self._directory)
+        reader = await asyncio.to_thread(HistoryReader, self._directory, self._behind)
         pieces = export(reader, form, selection, self._site)
         reading: asyncio.Task[str | None] | None = None
         try:

@@ -6,9 +6,7 @@ It makes no decision: it opens the port, moves bytes and time between the port (
 Rule 1: nothing here blocks the loop; ports are opened and closed in threads.
 Rule 2: a port that failed is opened again after 0.1 s, then after twice as long each time up to 4.5 s, so that one
         that is plugged in again is in use within 5 s. Bytes of the first 0.2 s are dropped: adapters spit.
-Rule 3: one log line when the line goes down, or cannot be opened for another reason than before, and one when it is
-        up. A port that is lost again and again within seconds is no news until it stays.
-Rule 4: a request goes out when the gap is over and not a timer's rounding later: the last millisecond is spent in
+Rule 3: a request goes out when the gap is over and not a timer's rounding later: the last millisecond is spent in
         turns of the loop, which go on serving everybody else.
 """
 
@@ -16,7 +14,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from random import Random
 
@@ -24,12 +22,11 @@ import serial
 
 from gateway.clock import Clock
 from gateway.core.engine import LineEngine
-from gateway.core.requests import Lane
 from gateway.core.settings import LineSettings
-from gateway.core.site import Device, LineStatus, Outcome, Ticket
-from gateway.core.stats import LineStats
+from gateway.core.site import Device
 from gateway.errors import PortError
 from gateway.lines.ports import close_port, open_port
+from gateway.lines.shell import STABLE_S, LineShell
 from gateway.lines.tap import Tap
 from gateway.lines.threads import in_thread
 from gateway.lines.transports import Transport, transport_for
@@ -38,101 +35,34 @@ log = logging.getLogger(__name__)
 
 FIRST_RETRY_S = 0.1
 LAST_RETRY_S = 4.5
-STABLE_S = 5.0  # a port that stayed so long works
 SETTLE_S = 0.2
 CLOSE_S = 1.0  # longer than that nobody waits for a port to close
 PRECISE_S = 0.0005  # timers are late or early by up to that
-SAID = 16  # reasons that are remembered
 
 
-class SerialLine:
+class SerialLine(LineShell):
     """One serial line: satisfies `core.site.LinePort`."""
 
     def __init__(
         self, settings: LineSettings, devices: Sequence[Device], clock: Clock, rng: Random | None = None
     ) -> None:
-        self.settings = settings
-        self.tap = Tap()
-        self._clock = clock
         self._rng = rng if rng is not None else Random()  # noqa: S311  # jitter, not secrets
-        self._engine = LineEngine(settings, devices, clock.monotonic(), self._rng)
+        super().__init__(LineEngine(settings, devices, clock.monotonic(), self._rng), devices, clock)
+        self.tap = Tap()
         self._char_s = settings.timing().char_s
         self._loop: asyncio.AbstractEventLoop | None = None
         self._timer: asyncio.Handle | None = None
         self._deadline = 0.0  # what the timer is for
         self._reply_by = 0.0  # the end of the wait for the reply under way, or sooner
-        self._wake: asyncio.Handle | None = None
         self._port: Transport | None = None
         self._failed: asyncio.Future[str] | None = None
-        self._down_at: float | None = None
         self._acted_at = 0.0  # when the engine last had its turn
-        self._idle: asyncio.Future[None] | None = None  # somebody waits until nothing is on the wire
-        self._said: set[str] = set()  # why it is down, as logged since it was up
-        self._flapping = False  # it was lost within seconds the last time
-        for device in devices:
-            device.line = self
-
-    @property
-    def name(self) -> str:
-        """See `LinePort.name`."""
-        return self.settings.name
-
-    @property
-    def index(self) -> int:
-        """See `LinePort.index`."""
-        return self.settings.index
-
-    @property
-    def port(self) -> str:
-        """See `LinePort.port`."""
-        return self.settings.port
-
-    @property
-    def stats(self) -> LineStats:
-        """See `LinePort.stats`."""
-        return self._engine.stats
-
-    def status(self, now: float) -> LineStatus:
-        """See `LinePort.status`."""
-        return self._engine.status(now)
-
-    def read(
-        self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "", background: bool = False
-    ) -> Ticket:
-        """See `LinePort.read`."""
-        lane = Lane.BACKGROUND if background else Lane.CLIENT
-        ticket = self._engine.read(device, pdu, done, self._clock.monotonic(), client=client, lane=lane)
-        self._wake_up()
-        return ticket
-
-    def write(self, device: Device, pdu: bytes, done: Callable[[Outcome], None], *, client: str = "") -> Ticket:
-        """See `LinePort.write`."""
-        ticket = self._engine.write(device, pdu, done, self._clock.monotonic(), client=client)
-        self._wake_up()
-        return ticket
-
-    def adjust(self, settings: LineSettings) -> None:
-        """Go on by other settings of the same wire; the port stays open and what is under way is not disturbed."""
-        self.settings = settings
-        self._engine.adjust(settings, self._clock.monotonic())
-        self._wake_up()
 
     def overdue_s(self, now: float) -> float:
         """How long the engine has had something to do and was not let; 0 while the port is not open."""
         if self._port is None or self._engine.next_deadline(now) is None:
             return 0.0
         return max(0.0, now - max(self._deadline, self._acted_at))
-
-    async def finish(self) -> None:
-        """Begin nothing more, answer 06 to what waits, return when nothing is on the wire."""
-        self._engine.finish()
-        self._idle = asyncio.get_running_loop().create_future()
-        self._advance()
-        await self._idle
-
-    def _wake_up(self) -> None:
-        if self._wake is None:
-            self._wake = asyncio.get_running_loop().call_soon(self._woken)
 
     async def run(self) -> None:
         """Own the port until cancelled: open it, serve it, and open it again when it fails."""
@@ -185,32 +115,13 @@ class SerialLine:
         self._complain(reason)
         return up_s
 
-    def _complain(self, reason: str) -> None:
-        if self._down_at is None:
-            self._down_at = self._clock.monotonic()
-        if reason not in self._said:
-            if len(self._said) < SAID:
-                self._said.add(reason)
-            log.error('event=line_down line=%s reason="%s"', self.name, reason)
-
-    def _announce(self) -> None:
-        lasted = "" if self._down_at is None else f" down_s={self._clock.monotonic() - self._down_at:.1f}"
-        log.info('event=line_up line=%s port="%s"%s', self.name, self.port, lasted)
-        self._down_at = None
-        self._said.clear()
-
     def _close(self, reason: str) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
         self._engine.closed(reason, self._clock.monotonic())
         self._engine.step(self._clock.monotonic())  # hands out what ended with the line
-        if self._idle is not None and not self._idle.done():
-            self._idle.set_result(None)
-
-    def _woken(self) -> None:
-        self._wake = None
-        self._advance()
+        self._rest()
 
     def on_bytes(self, data: bytes) -> None:
         """See `Owner.on_bytes`; before the line is open they are dropped."""
@@ -256,8 +167,7 @@ class SerialLine:
             self._reply_by = now if deadline is None else deadline
         if deadline is not None and self._loop is not None:
             self._set_alarm(deadline, self._loop)
-        if self._idle is not None and not self._idle.done() and not self._engine.busy:
-            self._idle.set_result(None)
+        self._rest()
 
     def _set_alarm(self, deadline: float, loop: asyncio.AbstractEventLoop) -> None:
         now = self._clock.monotonic()

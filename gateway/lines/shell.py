@@ -34,6 +34,7 @@ class LineShell(ABC):
         self._clock = clock
         self._engine = engine
         self._wake: asyncio.Handle | None = None
+        self._idle: asyncio.Future[None] | None = None  # somebody waits until nothing is under way
         self._down_at: float | None = None
         self._said: set[str] = set()  # why it is down, as logged since it was up
         self._flapping = False  # it was lost within seconds the last time
@@ -78,6 +79,24 @@ class LineShell(ABC):
         ticket = self._engine.write(device, pdu, done, self._clock.monotonic(), client=client)
         self._wake_up()
         return ticket
+
+    def adjust(self, settings: LineSettings) -> None:
+        """Go on by other settings of the same wire; it stays open and what is under way is not disturbed."""
+        self.settings = settings
+        self._engine.adjust(settings, self._clock.monotonic())
+        self._wake_up()
+
+    async def finish(self) -> None:
+        """Begin nothing more, answer 06 to what waits, return when nothing is under way."""
+        self._engine.finish()
+        self._idle = asyncio.get_running_loop().create_future()
+        self._advance()
+        await self._idle
+
+    def _rest(self) -> None:
+        """Tell who waits for it that nothing is under way."""
+        if self._idle is not None and not self._idle.done() and not self._engine.busy:
+            self._idle.set_result(None)
 
     def _wake_up(self) -> None:
         if self._wake is None:

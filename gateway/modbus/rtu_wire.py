@@ -14,6 +14,7 @@ class RtuWire:
     """Satisfies `Wire` for an `RtuClient`."""
 
     relays = False
+    silent = False
 
     def __init__(self, timing: Timing, counters: RtuCounters, *, quarantine_s: float) -> None:
         self.client = RtuClient(timing, counters, quarantine_s=quarantine_s)

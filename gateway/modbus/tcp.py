@@ -17,9 +17,11 @@ Rule 3, the time-out counts from the request to its whole reply. When a request 
 Rule 4: what was under way on a connection that is lost ends with ConnectionLost. It is blameless when others were
     under way too, or when the connection had answered before: then it was the connection, not the request. So is a
     time-out in company. A request that is alone has nobody to blame but itself.
-Rule 5, company: how many may be under way at once is learnt (pipelining.py). The first request of a connection is
+Rule 5, silence: a server is `silent` when three connections in a row ended by a time-out without a single reply, and
+    requests to more than one unit were among them. Then it stays so from one connection to the next until it answers.
+Rule 6, company: how many may be under way at once is learnt (pipelining.py). The first request of a connection is
     always alone.
-Rule 6, servers that close after every reply: after two connections that the other end closed with one reply each, a
+Rule 7, servers that close after every reply: after two connections that the other end closed with one reply each, a
     connection is taken for one request: after its reply nothing goes out into it, and we end it ourselves if the other
     end has not done so within 50 ms. Every ten minutes one is used on, to see whether that still holds.
 """
@@ -39,11 +41,12 @@ from gateway.modbus.pipelining import Window
 from gateway.modbus.transactions import Ended, Failed, Replied
 
 FINISHED = ""
-"""`drop` when the connection is to be ended although nothing is wrong with it (rule 6)."""
+"""`drop` when the connection is to be ended although nothing is wrong with it (rule 7)."""
 ONE_REPLY_TIMES = 2
 CLOSES_WITHIN_S = 0.05
 LOOK_AGAIN_S = 600.0
 MOST_RETIRED = 1024
+SILENT_TIMES = 3
 _TIDS = 0x10000
 _ADDRESSES = range(1, 248)
 
@@ -89,7 +92,14 @@ class TcpClient:
         self._one_reply = 0  # connections in a row that the other end closed after one reply
         self._look_again_at = -math.inf
         self._finish_at: float | None = None  # when we end a connection that the other end should have ended
+        self._silent = 0  # connections in a row that a time-out ended and nothing was heard on
+        self._unheard: set[int] = set()  # the units that were asked on them and timed out
         self.drop: str | None = None
+
+    @property
+    def silent(self) -> bool:
+        """Whether the server says nothing to anybody (rule 5)."""
+        return self._silent >= SILENT_TIMES and len(self._unheard) > 1
 
     @property
     def window(self) -> int:
@@ -127,6 +137,8 @@ class TcpClient:
             self._upstream.lost[self.drop or "finished"] += 1
         if len(self._under_way) > 1 and (remote or self.drop not in {None, "timeout"}):
             self._window.trouble(now)
+        if self.drop == "timeout" and not self._replies:
+            self._silent += 1
         ended = tuple(self._end(request, ConnectionLost("the connection was lost"), now) for request in self._waiting())
         self._under_way.clear()
         self._finish_at = None
@@ -196,6 +208,7 @@ class TcpClient:
             error = ReplyTimeout(f"no reply of unit {request.unit} within {request.timeout_s:g} s")
             del self._under_way[request.tid]
             self._suspect = request.company
+            self._unheard.add(request.unit)
             if request.number < self._newest_answered and len(self._retired) < MOST_RETIRED:
                 self._retired.add(request.tid)
             elif self.drop is None:
@@ -250,6 +263,8 @@ class TcpClient:
                 self._window.trouble(now)
             return self._end(request, error, now)
         self._replies += 1
+        self._silent = 0
+        self._unheard.clear()
         if self._replies > 1:
             self._one_reply = 0
         self._newest_answered = max(self._newest_answered, request.number)

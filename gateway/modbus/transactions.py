@@ -56,6 +56,11 @@ class Wire(Protocol):
         """Whether exceptions 0A and 0B are a gateway's word about a device, and not the device's own."""
         ...
 
+    @property
+    def silent(self) -> bool:
+        """Whether nobody at all answers, so that a missed reply says nothing of its device."""
+        ...
+
     def ready_at(self, now: float) -> float:
         """The earliest time from `now` on at which the next request may go out; infinite while there is no room."""
         ...

@@ -19,6 +19,7 @@ from gateway.service.tls import tls_advice
 from gateway.service.writes import write_advice
 
 SATURATED = 0.95
+SHORT_TIMEOUT_S = 1.0
 _NAMELESS = re.compile(
     r"/dev/serial/by-id/usb-"
     r"(1a86_USB[^-]*([-_]Ser[^-]*)?|Prolific_Technology_Inc\._USB-Serial_Controller(_[A-D])?|Silicon_Labs_CP21\w+_0001)-if"
@@ -38,7 +39,12 @@ def _lines(config: Config, budgets: Sequence[LineBudget]) -> Iterator[str]:
     for index, (line, budget) in enumerate(zip(config.line, budgets, strict=True)):
         path = f"line[{index}]"
         yield from _port(f"{path}.port", line, seen)
-        if budget.use_ratio > SATURATED:
+        if line.port.startswith("tcp://") and line.reply_timeout_s < SHORT_TIMEOUT_S:
+            yield (
+                f"{path}.reply_timeout_s: {line.reply_timeout_s:g} s has to do for the network, the server's own line "
+                "and its own wait for a silent controller; 2 or 3 s is usual for a Modbus TCP upstream"
+            )
+        if budget.use_ratio is not None and budget.use_ratio > SATURATED:
             yield (
                 f"{path}: polling would take {budget.use_ratio:.0%} of the line, so live values come every "
                 f"{budget.live_refresh_s:.1f} s; ask for them less often (poll.live_s) or use a second line"

@@ -21,6 +21,9 @@ from gateway.service.writes import rule_problems
 
 Raw = Mapping[str, object]
 
+SERIAL_KEYS = ("baudrate", "bytesize", "parity", "stopbits", "quarantine_s", "gap_s")
+UPSTREAM_KEYS = ("pipelining", "connect_timeout_s")
+
 
 def cross_problems(raw: Raw) -> list[Problem]:
     """Every problem of the file that takes more than one key to see."""
@@ -34,7 +37,7 @@ def cross_problems(raw: Raw) -> list[Problem]:
     ]
     for path, line in lines:
         problems += _repeated(((*at, "address"), device.get("address")) for at, device in _tables(line, "device", path))
-        problems += _upstream((*path, "port"), line.get("port"))
+        problems += _upstream(path, line)
     for path, device in devices:
         problems += _model(path, device)
     problems += _pair(raw, "http", "tls_certificate", "tls_private_key")
@@ -81,10 +84,16 @@ def _repeated(values: Iterator[tuple[Path, object]], *, secret: bool = False) ->
             seen[value] = path
 
 
-def _upstream(path: Path, port: object) -> Iterator[Problem]:
-    if isinstance(port, str) and port.startswith("tcp://"):
-        text = f"Modbus TCP upstreams are {NOT_SUPPORTED}; allowed: a device path, rfc2217://host:port or socket://host:port"
-        yield Problem(path, text)
+def _upstream(path: Path, line: Raw) -> Iterator[Problem]:
+    """Keys that a line of its kind has no use for."""
+    port = line.get("port")
+    if not isinstance(port, str):
+        return
+    upstream = port.startswith("tcp://")
+    for key in SERIAL_KEYS if upstream else UPSTREAM_KEYS:
+        if key in line:
+            what = "a Modbus TCP upstream" if upstream else "a serial port"
+            yield Problem((*path, key), f"has no meaning for {what}; allowed: leave it out")
 
 
 def _model(path: Path, device: Raw) -> Iterator[Problem]:

@@ -24,11 +24,11 @@ from gateway.faces.snmp.log_keeper import LogKeeper
 from gateway.faces.snmp.settings import SnmpSettings
 from gateway.history.keeper import HistoryKeeper
 from gateway.history.source import HistorySource
-from gateway.lines.serial import SerialLine
+from gateway.lines.factory import Line
 from gateway.service.conditions import ConditionKeeper
 from gateway.service.config import Config
 from gateway.service.parts import Listener, Runnable
-from gateway.service.settings import history_settings, http_settings, modbus_settings
+from gateway.service.settings import history_settings, http_settings, line_sites, modbus_settings
 from gateway.service.snmp import snmp_settings
 from gateway.service.south import South
 from gateway.service.supervisor import Supervisor
@@ -93,7 +93,7 @@ class Gateway:
         self.stats.restarts = self.supervisor.restarts
 
     @property
-    def lines(self) -> tuple[SerialLine, ...]:
+    def lines(self) -> tuple[Line, ...]:
         """The lines, in the order of the file."""
         return self._south.lines
 
@@ -239,7 +239,9 @@ class Gateway:
         return LogKeeper(site, source, history)
 
     def _log(self, config: Config) -> HistorySource | None:
-        return HistorySource(history_settings(config).directory, config.site) if config.history.enabled else None
+        if not config.history.enabled:
+            return None
+        return HistorySource(history_settings(config).directory, config.site, line_sites(config))
 
     def _harvester(self, config: Config, site: Site) -> tuple[HistoryKeeper, ...]:
         if self._history is None:

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from pydantic import AfterValidator, Field
 
 from gateway.core.ratelimit import ClientRate, LineRates
-from gateway.core.settings import LineSettings, PollSettings
+from gateway.core.settings import LineSettings, PollSettings, UpstreamSettings
 from gateway.core.write_wear import WearLimits
 from gateway.service.keys import (
     A_FILE,
@@ -73,10 +73,11 @@ __all__ = [
     "parse_root",
 ]
 
-PORT_SCHEMES = ("rfc2217", "socket")
+PORT_SCHEMES = ("rfc2217", "socket", "tcp")
 NOT_SUPPORTED = "not supported in this version"
 
 _LINE = LineSettings(name="", index=1, port="")
+_UPSTREAM = UpstreamSettings(host="", port=0)
 _POLL = PollSettings()
 _CLIENT_RATE = ClientRate()
 _LINE_RATES = LineRates()
@@ -90,8 +91,6 @@ def _port(text: str) -> str:
             raise ValueError("no absolute path")
         return text
     parts = urlsplit(text)
-    if parts.scheme == "tcp":  # crosscheck says that this is for a later version
-        return text
     if parts.scheme not in PORT_SCHEMES or not parts.hostname or parts.port is None or parts.path not in ("", "/"):
         raise ValueError("not a known URL")
     return text
@@ -135,14 +134,15 @@ class DeviceTable(Table):
 
 
 class LineTable(Table):
-    """`[[line]]`: a serial port and the controllers on it."""
+    """`[[line]]`: a serial port, or a Modbus TCP upstream, and the controllers on it."""
 
     name: Annotated[Name, Key(A_NAME, "What the line is called on every face; unique.")]
     port: Annotated[
         Annotated[str, AfterValidator(_port)],
         Key(
-            "a device path such as /dev/serial/by-id/usb-FTDI_…, rfc2217://host:port or socket://host:port",
-            "The serial port; used by one line only, and locked.",
+            "a device path such as /dev/serial/by-id/usb-FTDI_…, rfc2217://host:port, socket://host:port, or "
+            "tcp://host:port for a Modbus TCP server",
+            "The serial port, or the upstream; used by one line only, a device path is locked.",
         ),
     ]
     baudrate: Annotated[int, Key("300 to 230400", "Bits a second.")] = Field(default=_LINE.baudrate, ge=300, le=230400)
@@ -165,6 +165,25 @@ class LineTable(Table):
         Seconds,
         Key("0.0 to 1.0", "Silence kept between frames; 3.5 characters are kept in any case."),
     ] = Field(default=_LINE.gap_s, ge=0.0, le=1.0)
+    pipelining: Annotated[
+        int,
+        Key(
+            "1 to 32; tcp:// only",
+            "How many requests may be under way at once, if the server stands it; 1 sends one after the other.",
+        ),
+    ] = Field(default=_UPSTREAM.pipelining, ge=1, le=32)
+    connect_timeout_s: Annotated[
+        Seconds,
+        Key("0.1 to 60.0; tcp:// only", "How long a connection may take, name lookup included."),
+    ] = Field(default=_UPSTREAM.connect_timeout_s, ge=0.1, le=60.0)
+    site: Annotated[
+        Name | None,
+        Key(
+            A_NAME,
+            "The site that the line's controllers are shown under, where another gateway's site is behind it; "
+            "left out: the file's.",
+        ),
+    ] = None
     queue_limit: Annotated[
         int,
         Key("1 to 1000", "How many client reads may wait for the line; one more is answered 06."),
@@ -409,7 +428,7 @@ class Config(Table):
     ] = "/var/lib/prostar-gateway"
     line: Annotated[
         Annotated[tuple[LineTable, ...], Field(strict=False)],
-        Key("one [[line]] table or more", "The serial lines."),
+        Key("one [[line]] table or more", "The serial lines and upstreams."),
     ] = Field(min_length=1)
     poll: Annotated[PollTable, Key("a [poll] table", "How often values are wanted.")] = PollTable()
     cache: Annotated[CacheTable, Key("a [cache] table", "What may be answered from memory.")] = CacheTable()

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import ipaddress
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from gateway.core.budget import WATCH_S, LineBudget, line_budget
 from gateway.core.identity import Identity
 from gateway.core.ratelimit import ClientRate, LineRates
-from gateway.core.settings import LineSettings, PollSettings
+from gateway.core.settings import LineSettings, PollSettings, UpstreamSettings
 from gateway.core.site import Device
 from gateway.devices.schema import load_map
 from gateway.faces.http.settings import HttpSettings
@@ -47,9 +48,23 @@ def line_settings(config: Config) -> tuple[LineSettings, ...]:
             queue_limit_s=line.queue_limit_s,
             writes=line_writes(rules, line_devices(line)),
             poll=poll,
+            upstream=_upstream(line),
         )
         for number, line in enumerate(config.line, start=1)
     )
+
+
+def _upstream(line: LineTable) -> UpstreamSettings | None:
+    """Where a `tcp://` line leads; None: it is a serial port."""
+    parts = urlsplit(line.port)
+    if parts.scheme != "tcp" or parts.hostname is None or parts.port is None:
+        return None
+    return UpstreamSettings(parts.hostname, parts.port, line.pipelining, line.connect_timeout_s)
+
+
+def line_sites(config: Config) -> dict[str, str]:
+    """The lines behind which there is another site, and its name."""
+    return {line.name: line.site for line in config.line if line.site is not None}
 
 
 def line_devices(line: LineTable) -> tuple[Device, ...]:

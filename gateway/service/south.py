@@ -1,7 +1,7 @@
 """Everything south of the faces, of one configuration: its lines and devices.
 
 Rule 1: a line whose port, wire and devices are those of before is the same object, with its connections, snapshots
-        and counters; only what it can change at work is changed (`SerialLine.adjust`).
+        and counters; only what it can change at work is changed (`LineShell.adjust`).
 Rule 2: any other line is a new one. The old one has to stop before it can have the port.
 """
 
@@ -12,17 +12,17 @@ from dataclasses import dataclass
 from gateway.clock import Clock
 from gateway.core.settings import LineSettings
 from gateway.core.site import Device, Site
-from gateway.lines.serial import SerialLine
+from gateway.lines.factory import Line, make_line
 from gateway.service.config import Config
 from gateway.service.schema import DeviceTable
-from gateway.service.settings import line_devices, line_settings
+from gateway.service.settings import line_devices, line_settings, line_sites
 
 
 @dataclass(frozen=True, slots=True)
 class Built:
     """A line and what it was made of."""
 
-    line: SerialLine
+    line: Line
     settings: LineSettings
     tables: tuple[DeviceTable, ...]
     devices: tuple[Device, ...]
@@ -46,14 +46,15 @@ class South:
                 built.append(Built(old.line, settings, old.tables, old.devices))
                 continue
             devices = line_devices(table)
-            built.append(Built(SerialLine(settings, devices, clock), settings, table.device, devices))
-        if before is not None and _alike(config.site, built, before):
+            built.append(Built(make_line(settings, devices, clock), settings, table.device, devices))
+        behind = line_sites(config)
+        if before is not None and _alike(config.site, behind, built, before):
             return cls(tuple(built), before.site)
         found = [device for each in built for device in each.devices]
-        return cls(tuple(built), Site.of(config.site, [each.line for each in built], found))
+        return cls(tuple(built), Site.of(config.site, [each.line for each in built], found, behind))
 
     @property
-    def lines(self) -> tuple[SerialLine, ...]:
+    def lines(self) -> tuple[Line, ...]:
         """The lines alone."""
         return tuple(built.line for built in self.built)
 
@@ -65,7 +66,8 @@ class South:
                 built.line.adjust(built.settings)
 
 
-def _alike(name: str, built: list[Built], before: South) -> bool:
+def _alike(name: str, behind: dict[str, str], built: list[Built], before: South) -> bool:
     """Whether it is the same site: the same lines in the same places, under the same name."""
     places = [(each.line, each.settings.index) for each in built]
-    return name == before.site.name and places == [(each.line, each.settings.index) for each in before.built]
+    same = name == before.site.name and behind == before.site.behind
+    return same and places == [(each.line, each.settings.index) for each in before.built]

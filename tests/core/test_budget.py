@@ -33,12 +33,15 @@ def test_use_grows_with_devices_and_falls_with_the_period() -> None:
     one = line_budget(settings(), [PROSTAR]).use_ratio
     three = line_budget(settings(), [PROSTAR] * 3).use_ratio
     slow = line_budget(settings(poll=PollSettings(live_s=10.0)), [PROSTAR]).use_ratio
+    assert one is not None
+    assert three is not None
     assert three == pytest.approx(3 * one)
     assert slow == pytest.approx(one / 10, rel=0.05)
 
 
 def test_a_line_asked_for_too_much_stretches_all_periods() -> None:
     budget = line_budget(settings(), [PROSTAR] * 10)
+    assert budget.use_ratio is not None
     assert budget.use_ratio > 1
     assert budget.live_refresh_s == pytest.approx(budget.use_ratio)
 

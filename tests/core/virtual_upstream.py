@@ -113,6 +113,10 @@ class VirtualUpstream:
         self._connection = None
         self._connect_at = self.now + RECONNECT_S
         self.engine.lost(self.now, remote=remote)
+        if self.engine.silent:
+            self.engine.closed("silent", self.now)
+            self._open = False
+            self._connect_at = self.now + 0.5
 
     def _write(self) -> None:
         while (frame := self.engine.step(self.now)) is not None:

@@ -21,7 +21,9 @@ UNITS = 3
 def live_s_for(use: float) -> float:
     """How often live values are wanted for the polls to take this share of the line."""
     settings = LineSettings(name="line", index=1, port="virtual", poll=PollSettings(1.0, 86400.0))
-    return line_budget(settings, [MAP] * UNITS).use_ratio / use
+    ratio = line_budget(settings, [MAP] * UNITS).use_ratio
+    assert ratio is not None, "it is a serial line"
+    return ratio / use
 
 
 def site(tmp_path: Path, live_s: float) -> tuple[list[SimulatedController], VirtualGateway]:

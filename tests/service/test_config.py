@@ -298,9 +298,14 @@ listen = ["127.0.0.1:70000"]
             'line[0].device[0].model: "prostar" has no map; allowed: "prostar-mppt"',
         ),
         (
-            replaced('"/dev/serial/by-id/usb-a"', '"tcp://10.0.0.1:502"'),
-            "Modbus TCP upstreams are not supported in this",
+            replaced('"/dev/serial/by-id/usb-a"', '"tcp://10.0.0.1:502"\nbaudrate = 19200'),
+            "line[0].baudrate: has no meaning for a Modbus TCP upstream",
         ),
+        (
+            replaced('"/dev/serial/by-id/usb-a"', '"/dev/serial/by-id/usb-a"\npipelining = 4'),
+            "line[0].pipelining: has no meaning for a serial port",
+        ),
+        (replaced('"/dev/serial/by-id/usb-a"', '"tcp://10.0.0.1"'), "allowed: a device path such as"),
         (
             replaced('"/dev/serial/by-id/usb-a"', '"loop://"'),
             'line[0].port: "loop://" is not allowed; allowed: a device',

@@ -12,8 +12,10 @@ import pytest
 from gateway.clock import SystemClock
 from gateway.core.budget import WATCH_S
 from gateway.core.identity import Identity
+from gateway.core.settings import UpstreamSettings
 from gateway.faces.snmp.settings import Emc1Device
 from gateway.service.config import Config, parse_config
+from gateway.service.crosscheck import UPSTREAM_KEYS
 from gateway.service.gateway import Gateway
 from gateway.service.loops import Loop, loop_factory
 from gateway.service.schema import LineTable, PollTable
@@ -94,13 +96,35 @@ def config() -> Config:
 def test_every_key_of_a_line_reaches_its_settings(config: Config) -> None:
     first, second = line_settings(config)
     table = config.line[0]
-    for key in LineTable.model_fields.keys() - {"device"}:
+    for key in LineTable.model_fields.keys() - {"device", "site", *UPSTREAM_KEYS}:
         assert getattr(first, key) == getattr(table, key), key
         if key not in {"name", "port", "bytesize"}:
             assert getattr(first, key) != getattr(second, key), key  # the test's values are not the defaults
     assert (first.index, second.index) == (1, 2)
     for settings in (first, second):
         assert all(getattr(settings.poll, key) == getattr(config.poll, key) for key in PollTable.model_fields)
+
+
+def test_every_key_of_an_upstream_reaches_its_settings() -> None:
+    upstream = """
+[[line]]
+name = "ridge-08"
+port = "tcp://[2001:db8::8]:1502"
+site = "ridge-08"
+pipelining = 3
+connect_timeout_s = 7.5
+[[line.device]]
+name = "far"
+address = 11
+unit_id = 99
+model = "prostar-mppt"
+"""
+    config = parse_config(TEXT.replace("[modbus]", f"{upstream}\n[modbus]", 1))
+    settings = line_settings(config)
+    assert settings[2].upstream == UpstreamSettings("2001:db8::8", 1502, 3, 7.5)
+    assert [line.upstream for line in settings[:2]] == [None, None]
+    site = Gateway(config, SystemClock()).site
+    assert [site.of_line(line.name) for line in site.lines] == ["ridge-07", "ridge-07", "ridge-08"]
 
 
 def test_devices_know_their_map_and_reading(config: Config) -> None:
@@ -178,6 +202,8 @@ def test_a_site_has_its_devices_by_unit_id_and_line(config: Config) -> None:
 
 def test_a_line_with_more_devices_is_used_more(config: Config) -> None:
     first, second = line_budgets(config)
+    assert second.use_ratio is not None
+    assert first.use_ratio is not None
     assert 0 < second.use_ratio < first.use_ratio < 1
     assert first.reply_deadline_s < second.reply_deadline_s  # shorter queue and time-out, one retry less
     assert modbus_settings(config).reply_timeout_s == second.reply_deadline_s - WATCH_S

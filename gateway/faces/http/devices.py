@@ -64,7 +64,7 @@ DEVICE_METRICS = (UP, AGE, STATE, INFO, CONDITION)
 
 def device_labels(site: Site, device: Device) -> Labels:
     """The values of `DEVICE_LABELS`."""
-    return (device.name, device.line.name, device.map.model, site.name, str(device.unit_id))
+    return (device.name, device.line.name, device.map.model, site.of_line(device.line.name), str(device.unit_id))
 
 
 def point_metric(point: Point) -> MetricInfo | None:

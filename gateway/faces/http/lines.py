@@ -28,6 +28,7 @@ LINE_LABELS = ("line", "site")
 _ECHO = {"present": 1.0, "absent": 0.0}
 
 ERROR_KINDS = ("timeout", "crc", "mismatch", "exception")
+CONNECTION_ENDS = ("finished", "closed", "timeout")
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +78,11 @@ def _wire_frames(view: LineView) -> Mapping[str, int]:
     }
 
 
+def _connections(view: LineView) -> Mapping[str, int]:
+    upstream = view.port.stats.upstream
+    return {} if upstream is None else dict.fromkeys(CONNECTION_ENDS, 0) | upstream.lost
+
+
 def _device_errors(device: Device) -> Mapping[str, int]:
     return dict.fromkeys(ERROR_KINDS, 0) | device.stats.errors
 
@@ -124,6 +130,22 @@ LINE_RULES: tuple[Rule[LineView], ...] = (
     times(
         _line_histogram("reply_seconds", "From sending a request to its whole reply."),
         lambda view: view.port.stats.reply_time,
+    ),
+    known(
+        _line_counter("connections", "Connections made to a Modbus TCP upstream."),
+        lambda view: None if view.port.stats.upstream is None else view.port.stats.upstream.connections,
+    ),
+    known(
+        _line_counter("connections_refused", "Attempts that gave no connection to the upstream."),
+        lambda view: None if view.port.stats.upstream is None else view.port.stats.upstream.refused,
+    ),
+    each(
+        _line_counter("connections_ended", "Connections to the upstream that ended, by why.", "reason"),
+        _connections,
+    ),
+    known(
+        _line_gauge("window", "How many requests the upstream is given at once, as learnt."),
+        lambda view: None if view.port.stats.upstream is None else view.port.stats.upstream.window,
     ),
     each(_line_counter("discarded_bytes", "Received bytes that were of no use, by kind.", "kind"), _wire_bytes),
     each(_line_counter("discarded_frames", "Received frames that were of no use, by kind.", "kind"), _wire_frames),

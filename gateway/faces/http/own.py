@@ -239,7 +239,7 @@ class OwnMetrics:
         """`started_at` is wall time."""
         self._counts = counts
         self._started_at = started_at
-        self._lines = [Source.labelled(line, LINE_LABELS, (line.name, site.name)) for line in site.lines]
+        self._lines = [Source.labelled(line, LINE_LABELS, (line.name, site.of_line(line.name))) for line in site.lines]
         self._devices = [Source.labelled(device, DEVICE_LABELS, device_labels(site, device)) for device in site.devices]
 
     def families(self, now: float) -> Iterator[tuple[MetricInfo, Lines]]:

@@ -141,7 +141,7 @@ def layout(maps: Iterable[DeviceMap], root: Oid = DEFAULT_ROOT) -> Layout:
             "The devices of the gateway, by unit id. Every row always answers, whatever the device does.",
             RowKind.DEVICE,
             "pgwDeviceUnitId",
-            (*tables.DEVICE, *condition_tables.DEVICE),
+            (*tables.DEVICE, *condition_tables.DEVICE, *tables.DEVICE_SITE),
         ),
         Table(
             (*objects, 8),

@@ -287,6 +287,13 @@ LINE: tuple[ObjectType, ...] = (
         lambda row, _now: text(_top_client(row)[0]),
     ),
     _milliseconds(38, "pgwLineTopClientTime", "Line time that pgwLineTopClient used.", lambda row: _top_client(row)[1]),
+    _fixed(
+        39,
+        "pgwLineSite",
+        Syntax.TEXT,
+        "Name of the site that the line belongs to: pgwSiteName, or where another gateway's site is behind it.",
+        lambda row: text(row.gateway.site.of_line(row.line.name)),
+    ),
 )
 
 
@@ -455,3 +462,15 @@ DEVICE: tuple[ObjectType, ...] = (
         lambda row: row.device.stats.identity_mismatches,
     ),
 )
+
+
+DEVICE_SITE: tuple[ObjectType, ...] = (
+    _fixed(
+        28,
+        "pgwDeviceSite",
+        Syntax.TEXT,
+        "Name of the site that the device belongs to: pgwSiteName, or where another gateway's site is behind its line.",
+        lambda row: text(row.gateway.site.of_line(row.device.line.name)),
+    ),
+)
+"""What came after the columns of the conditions."""

@@ -25,6 +25,7 @@ from gateway.faces.http.exposition import Exposition
 from gateway.faces.http.lines import ERROR_KINDS
 from gateway.faces.http.metric import MetricInfo, MetricKind
 from gateway.faces.http.own import OWN_METRICS, Counts, HttpStats
+from gateway.modbus.counters import UpstreamCounters
 from tests.faces.http.scrapes import parse, scrape
 
 from .conftest import ManualClock, UnreadableLine
@@ -112,6 +113,7 @@ def test_what_is_collected_is_what_is_described(site: Site, clock: ManualClock) 
     line, device = site.lines[0], site.devices[0]
     line.stats.seconds_by_client["10.0.0.1"] = 1.0
     device.stats.refresh_s = 1.0
+    line.stats.upstream = UpstreamCounters()
     of_device = DeviceHistoryStats(2, Counter(refused=1), days=256, apart=1, harvested_at=clock.now)
     history = HistoryStats({11: of_device}, store_up=True, store_errors=Counter(full=1))
     clients = ClientTable(modbus, burst_s=2.0)

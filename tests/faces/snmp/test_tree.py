@@ -139,7 +139,7 @@ def test_the_device_row_answers_in_every_state(
     device = site.by_unit[21]
     device.snapshot = replace(device.snapshot, state=state)
     row = [oid for oid in walk(agent, clock.now) if oid[:-2] == (*LIVE[:-2], 3, 1) and oid[-1] == 21]
-    columns = (*tables.DEVICE, *condition_tables.DEVICE)
+    columns = (*tables.DEVICE, *condition_tables.DEVICE, *tables.DEVICE_SITE)
     assert [oid[-2] for oid in row] == [column.number for column in columns]
 
 

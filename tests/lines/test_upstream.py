@@ -1,0 +1,198 @@
+"""Modbus TCP upstreams over real sockets: connections, their ends, and what becomes of the line."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import socket
+import time
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+
+from gateway.clock import SystemClock
+from gateway.core.settings import LineSettings, PollSettings, UpstreamSettings
+from gateway.core.site import Device, LineState, Outcome
+from gateway.core.snapshot import DeviceState
+from gateway.devices.schema import load_map
+from gateway.errors import LineDown
+from gateway.lines.upstream import UpstreamLine
+from gateway.modbus.pdu import Function, ReadRequest
+from gateway.simulator.oracle import OracleController
+from gateway.simulator.tcp import TcpServer
+from gateway.simulator.upstream import Habits, SimulatedServer
+from tests.faults.rig import oracle_map
+from tests.lines.rig import lag_meter, until
+
+FAST = PollSettings(live_s=0.2, settings_s=60.0)
+
+
+def controllers(count: int) -> list[OracleController]:
+    return [OracleController(oracle_map(), device=k, address=k + 1, turnaround_s=0.002) for k in range(count)]
+
+
+def devices(count: int) -> list[Device]:
+    return [Device(f"array-{k}", 10 + k, k + 1, oracle_map()) for k in range(count)]
+
+
+def line_to(host: str, port: int, units: list[Device], **settings: Any) -> UpstreamLine:
+    upstream = UpstreamSettings(host, port, connect_timeout_s=settings.pop("connect_timeout_s", 2.0))
+    settings = {"poll": FAST, "reply_timeout_s": 0.3, **settings}
+    where = f"tcp://{host}:{port}"
+    return UpstreamLine(LineSettings("site-a", 1, where, upstream=upstream, **settings), units, SystemClock())
+
+
+@contextlib.asynccontextmanager
+async def running(line: UpstreamLine) -> AsyncIterator[UpstreamLine]:
+    task = asyncio.create_task(line.run())
+    try:
+        yield line
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+async def ask(line: UpstreamLine, device: Device, first: int = 0, count: int = 10) -> Outcome:
+    done: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
+    line.read(device, ReadRequest(Function.READ_HOLDING_REGISTERS, first, count).encode(), done.set_result)
+    async with asyncio.timeout(10):
+        return await done
+
+
+def state(line: UpstreamLine) -> LineState:
+    return line.status(SystemClock().monotonic()).state
+
+
+def all_online(units: list[Device]) -> bool:
+    return all(device.snapshot.state is DeviceState.ONLINE for device in units)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "localhost"])
+async def test_values_come_over_ipv4_ipv6_and_by_name(host: str) -> None:
+    units = devices(3)
+    listen = "127.0.0.1" if host == "localhost" else host
+    async with (
+        TcpServer(SimulatedServer(controllers(3)), host=listen) as server,
+        running(line_to(host, server.port, units)) as line,
+    ):
+        await until(lambda: all_online(units))
+        assert line.stats.upstream is not None
+        assert line.stats.upstream.connections == 1
+        assert server.server.counters.most_waiting > 1, "requests are pipelined"
+
+
+async def test_a_server_that_closes_after_every_reply_gives_no_error_and_no_pause() -> None:
+    units = devices(2)
+    simulated = SimulatedServer(controllers(2), habits=Habits(closes=True))
+    async with TcpServer(simulated) as server, running(line_to("127.0.0.1", server.port, units)) as line:
+        await until(lambda: all_online(units))
+        began = SystemClock().monotonic()
+        for k in range(30):
+            assert isinstance(await ask(line, units[k % 2]), bytes)
+        assert SystemClock().monotonic() - began < 3.0
+        assert set(line.stats.failed) <= {"connection_lost", "exception"}
+        assert line.stats.failed["connection_lost"] <= 2, "until its habit is known"
+        assert line.stats.opens == 1
+        assert simulated.counters.most_open <= 2, "the next may come in before the last is gone"
+        await until(lambda: simulated.counters.open_connections <= 1)
+        assert all_online(units)
+
+
+async def test_a_refused_connection_takes_the_line_down_and_it_recovers_alone(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    units = devices(1)
+    caplog.set_level(logging.INFO)
+    server = TcpServer(SimulatedServer(controllers(1)))
+    async with server, running(line_to("127.0.0.1", server.port, units)) as line:
+        await until(lambda: all_online(units))
+        server.close()
+        await until(lambda: state(line) is LineState.DOWN)
+        assert units[0].snapshot.state is DeviceState.STALE
+        assert isinstance(await ask(line, units[0]), LineDown)
+        assert "connection refused" in line.status(0.0).error
+        await server.open()
+        await until(lambda: all_online(units))
+        said = [record.message for record in caplog.records if "event=line_" in record.message]
+        assert len([text for text in said if "event=line_down" in text]) == 1
+
+
+async def test_a_cut_connection_is_followed_by_the_next_and_nobody_notices() -> None:
+    units = devices(2)
+    async with (
+        TcpServer(SimulatedServer(controllers(2))) as server,
+        running(line_to("127.0.0.1", server.port, units)) as line,
+    ):
+        await until(lambda: all_online(units))
+        for _ in range(5):
+            server.cut()
+            assert isinstance(await ask(line, units[0]), bytes)
+        assert line.stats.opens == 1
+        assert all_online(units)
+
+
+async def test_a_name_that_nobody_knows_is_said_and_costs_the_loop_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow(*_: object, **__: object) -> list[object]:
+        time.sleep(0.4)
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", slow)
+    line = line_to("no-such-host.invalid", 502, devices(1), connect_timeout_s=0.1)
+    async with lag_meter() as lag, running(line):
+        await until(lambda: "within 0.1 s" in line.status(0.0).error)
+        await until(lambda: "is not known" in line.status(0.0).error)
+    assert lag.worst_s < 0.2
+
+
+async def test_a_server_that_does_not_answer_the_connection_attempt_is_given_up() -> None:
+    with socket.create_server(("127.0.0.1", 0), backlog=0) as full:
+        port = full.getsockname()[1]
+        waiting = [socket.socket() for _ in range(4)]
+        for sock in waiting:
+            sock.setblocking(False)
+            sock.connect_ex(("127.0.0.1", port))
+        async with running(line_to("127.0.0.1", port, devices(1), connect_timeout_s=0.2)) as line:
+            await until(lambda: "no answer to the connection attempt" in line.status(0.0).error)
+        for sock in waiting:
+            sock.close()
+
+
+async def test_a_server_that_closes_at_once_is_no_line_and_is_not_stormed() -> None:
+    simulated = SimulatedServer([])
+    simulated.refusing = True
+    async with TcpServer(simulated) as server, running(line_to("127.0.0.1", server.port, devices(1))) as line:
+        await until(lambda: "at once" in line.status(0.0).error or state(line) is LineState.DOWN)
+        assert line.stats.upstream is not None
+        before = line.stats.upstream.connections
+        await asyncio.sleep(0.5)
+        assert line.stats.upstream.connections - before < 10
+
+
+async def test_a_silent_server_is_dropped_and_the_loop_is_free() -> None:
+    units = devices(1)
+    simulated = SimulatedServer([], habits=Habits(silence=None))
+    async with (
+        TcpServer(simulated) as server,
+        lag_meter() as lag,
+        running(line_to("127.0.0.1", server.port, units, reply_timeout_s=0.05)) as line,
+    ):
+        await until(lambda: units[0].snapshot.state is DeviceState.OFFLINE)
+        assert line.stats.upstream is not None
+        assert line.stats.upstream.lost["timeout"] >= 2
+    assert lag.worst_s < 0.3
+
+
+async def test_the_prostar_map_is_served_by_a_real_server() -> None:
+    from gateway.simulator.device import SimulatedController
+
+    device_map = load_map("prostar-mppt")
+    unit = Device("array-1", 11, 1, device_map)
+    async with (
+        TcpServer(SimulatedServer([SimulatedController(device_map)])) as server,
+        running(line_to("127.0.0.1", server.port, [unit])),
+    ):
+        await until(lambda: unit.snapshot.state is DeviceState.ONLINE)
+        assert 11 < unit.snapshot.shown()["battery_voltage"] < 15
