@@ -37,3 +37,6 @@ async def test_reset_with_requests_under_way(running: Running) -> None:
     other = await running.connect()
     line.held = False
     assert await other.query(12, READ_1) == GOOD_REPLY[7:]
+    assert (world.stats.requests, world.stats.forwarded, world.stats.connections) == (3, 3, 2)
+    assert world.stats.open_connections == 1
+    assert not world.stats.closed, "nobody had to end it"
