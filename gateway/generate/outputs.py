@@ -18,6 +18,7 @@ from gateway.generate.registers import register_outputs
 from gateway.generate.rules import rule_outputs
 from gateway.generate.snmp_exporter import exporter_outputs
 from gateway.generate.snmpd import snmpd_outputs
+from gateway.generate.status import status_outputs
 from gateway.generate.telegraf import telegraf_outputs
 from gateway.generate.zabbix import zabbix_outputs
 
@@ -29,6 +30,7 @@ def outputs() -> dict[str, str]:
     return _together(
         mib_outputs(),
         register_outputs(),
+        status_outputs(),
         metric_outputs(),
         rule_outputs(),
         dashboard_outputs(),

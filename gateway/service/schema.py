@@ -328,6 +328,9 @@ class ModbusTable(Table):
         Key(NETWORKS, "Clients that always get in: over a limit, a connection without priority makes room."),
     ] = ()
     allow: Annotated[Networks, Key(NETWORKS, "Who may connect; others are closed before a byte is read.")] = LOOPBACK
+    status_unit: Annotated[
+        bool, Key("true or false", "Unit id 255 answers the gateway's own registers (registers/gateway.md).")
+    ] = False
     strict_map: Annotated[
         bool,
         Key("true or false", "Answer 02 for ranges outside of the map without asking the controller."),

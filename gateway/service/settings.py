@@ -110,6 +110,7 @@ def modbus_settings(config: Config) -> ModbusSettings:
         max_age_s=config.cache.max_age_s,
         writes=write_settings(config),
         tls=tls_settings(config),
+        status_unit=modbus.status_unit,
         strict_map=modbus.strict_map,
         reply_timeout_s=deadline_s - WATCH_S,
         stop_grace_s=STOP_GRACE_S,

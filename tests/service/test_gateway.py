@@ -75,6 +75,7 @@ listen = ["127.0.0.1:0", "[::1]:0"]
 max_connections = 3
 allow = ["10.1.2.0/24", "10.9.9.9"]
 strict_map = true
+status_unit = true
 [snmp]
 listen = ["127.0.0.1:0"]
 enterprise_root = "1.3.6.1.4.1.12345.7"
@@ -146,6 +147,7 @@ def test_the_faces_get_their_settings(config: Config) -> None:
     assert modbus.listen == (("127.0.0.1", 0), ("::1", 0))
     assert modbus.allow == (ip_network("10.1.2.0/24"), ip_network("10.9.9.9/32"))
     assert (modbus.max_connections, modbus.max_age_s, modbus.strict_map) == (3, 7.0, True)
+    assert modbus.status_unit
     snmp = snmp_settings(config)
     assert snmp.listen == (("127.0.0.1", 0),)
     assert [(entry.name, entry.sources) for entry in snmp.communities] == [("s3cret", (ip_network("10.0.0.0/8"),))]

@@ -19,6 +19,8 @@ from gateway.core.ratelimit import CLIENT, CLIENT_LINE, LineLimiter
 from gateway.core.serving import Ask, FromMemory, Serving
 from gateway.core.site import Device, Outcome, Site, Ticket
 from gateway.core.stats import ModbusServerStats
+from gateway.core.status_registers import FUNCTIONS, StatusRegisters
+from gateway.core.status_registers import UNIT as STATUS_UNIT
 from gateway.core.write_rules import Requester
 from gateway.core.writing import Job
 from gateway.errors import IllegalFunction, RateLimited, RequestError, UnitNotRouted
@@ -32,6 +34,7 @@ logger = logging.getLogger(__name__)
 
 _OWN_LIMITS = (CLIENT, CLIENT_LINE)
 
+_UNIT_AT = 4  # of an ADU without its transaction id
 BROADCAST = 0
 RESERVED = range(248, 255)
 """Unit ids that no device may have (Modbus over serial line 2.2)."""
@@ -126,13 +129,15 @@ class Dispatcher:
         self.now = clock.monotonic
         self._audit = shared.audit
         self._routes = routes
+        self._own: StatusRegisters | None = None
         self._barred = barred
         self._limiter = shared.limiter
         self._writer = shared.writer
 
-    def reroute(self, routes: Mapping[int, Serving], shared: Shared) -> None:
-        """Serve these from now on; what is under way ends as it began."""
+    def reroute(self, routes: Mapping[int, Serving], shared: Shared, own: StatusRegisters | None = None) -> None:
+        """Serve these from now on, and `own` as unit 255; what is under way ends as it began."""
         self._routes = routes
+        self._own = own
         self._limiter = shared.limiter
         self._writer = shared.writer
         self.hot.clear()
@@ -154,31 +159,36 @@ class Dispatcher:
             self.stats.cache_hits += 1
             return entry[3]
         try:
-            requester = Requester(client.name, role)
-            serving = self._route(unit, pdu, requester, now)
-            writer = self._writer
-            rules = None if writer is None else writer.rules(serving.device)
-            decision = decide(pdu[0], serving.functions, rules, requester)
-            if not decision.allowed:
-                raise self._refused(Refusal(decision, IllegalFunction()), requester, unit, pdu, now)
-            if decision.reason is Reason.WRITE and writer is not None:
-                planned = writer.plan(serving.device, requester, pdu)
-                if isinstance(planned, Refusal):
-                    raise self._refused(planned, requester, unit, pdu, now)
-                if not planned.slave_control:  # which nobody's flood of the line may hold back
-                    self._check_rate(client, serving.device, now)
-                self._forwarded(client)
-                return WriteOrder(unit, serving, planned, writer)
-            answer = serving.answer(pdu, now)
-            if isinstance(answer, Ask):
-                self._check_rate(client, serving.device, now)
+            return self._look_at(request, pdu, client, Requester(client.name, role), now)
         except RequestError as error:
             return self.refuse(unit, pdu, client, error)
+
+    def _look_at(self, request: bytes, pdu: bytes, client: Client, requester: Requester, now: float) -> bytes | Waiting:
+        """What comes of a request that was paid for; raises the RequestError that refuses it."""
+        unit = request[_UNIT_AT]
+        if unit == STATUS_UNIT and self._own is not None and not self._barred:
+            return self._answer_myself(self._own, pdu, requester, now)
+        serving = self._route(unit, pdu, requester, now)
+        writer = self._writer
+        rules = None if writer is None else writer.rules(serving.device)
+        decision = decide(pdu[0], serving.functions, rules, requester)
+        if not decision.allowed:
+            raise self._refused(Refusal(decision, IllegalFunction()), requester, unit, pdu, now)
+        if decision.reason is Reason.WRITE and writer is not None:
+            planned = writer.plan(serving.device, requester, pdu)
+            if isinstance(planned, Refusal):
+                raise self._refused(planned, requester, unit, pdu, now)
+            if not planned.slave_control:  # which nobody's flood of the line may hold back
+                self._check_rate(client, serving.device, now)
+            self._forwarded(client)
+            return WriteOrder(unit, serving, planned, writer)
+        answer = serving.answer(pdu, now)
         if isinstance(answer, FromMemory):
             self.stats.cache_hits += 1
             reply = mbap.encode(0, unit, answer.reply)[2:]
             self.hot.keep(request, serving.device, answer, reply)
             return reply
+        self._check_rate(client, serving.device, now)
         self._forwarded(client)
         return Forward(unit, serving, answer)
 
@@ -196,6 +206,14 @@ class Dispatcher:
             self.stats.exceptions[outcome[1]] += 1
             client.exceptions[outcome[1]] += 1
         return mbap.encode(0, waiting.unit, outcome)[2:]
+
+    def _answer_myself(self, own: StatusRegisters, pdu: bytes, requester: Requester, now: float) -> bytes:
+        decision = decide(pdu[0], FUNCTIONS)
+        if not decision.allowed:
+            raise self._refused(Refusal(decision, IllegalFunction()), requester, STATUS_UNIT, pdu, now)
+        reply = own.answer(pdu, now)
+        self.stats.cache_hits += 1
+        return mbap.encode(0, STATUS_UNIT, reply)[2:]
 
     def _route(self, unit: int, pdu: bytes, requester: Requester, now: float) -> Serving:
         if self._barred:

@@ -16,6 +16,7 @@ import socket
 from collections.abc import Sequence
 from functools import partial
 
+from gateway import __version__
 from gateway.clock import Clock
 from gateway.core.budget import WATCH_S
 from gateway.core.clients import Client, ClientTable
@@ -24,6 +25,7 @@ from gateway.core.policy import Audit
 from gateway.core.ratelimit import LineLimiter
 from gateway.core.site import Site
 from gateway.core.stats import ModbusServerStats, TlsStats
+from gateway.core.status_registers import StatusRegisters
 from gateway.errors import ListenError, TlsFilesError
 from gateway.faces.modbus.accepting import Acceptor, listening_socket
 from gateway.faces.modbus.admission import decide, rate_of
@@ -148,6 +150,7 @@ class ModbusServer:
         self._sweep: asyncio.TimerHandle | None = None
         self._refusals_told = LogBudget()
         self._ends_told = LogBudget()
+        self._started_at = clock.monotonic()
         self._shared = self._share(settings, site)
         self.dispatcher = Dispatcher({}, clock, self._shared)
         self._of_line: dict[str, Dispatcher] = {}
@@ -204,7 +207,10 @@ class ModbusServer:
 
     def _route(self, settings: ModbusSettings, site: Site) -> None:
         routes = Routes(settings, site)
-        self.dispatcher.reroute(routes.by_unit(), self._shared)
+        own = None
+        if settings.status_unit:
+            own = StatusRegisters(site, self.stats, started_at=self._started_at, version=__version__)
+        self.dispatcher.reroute(routes.by_unit(), self._shared, own)
         for group in settings.lines:
             dispatcher = self._of_line.setdefault(group.line, Dispatcher({}, self._clock, self._shared))
             dispatcher.reroute(routes.of_line(group.line), self._shared)

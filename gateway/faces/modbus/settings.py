@@ -77,6 +77,7 @@ class ModbusSettings:
     max_age_s: float = 5.0  # `[cache] max_age_s`: older is never served from memory
     writes: WriteSettings | None = None  # None: every write is refused
     tls: TlsSettings | None = None  # None: no TLS
+    status_unit: bool = False  # True: unit id 255 answers the gateway's own registers (core/status_registers.py)
     strict_map: bool = False  # True: exception 02 outside of the map without asking the device
     idle_timeout_s: float = 600.0  # no request for so long: the connection is closed
     frame_timeout_s: float = 5.0  # a request must be complete so long after its first byte
