@@ -37,6 +37,7 @@ peers=(
   "nodejs node"
   "npm npm"
   "libsnmp-dev /usr/include/net-snmp/net-snmp-config.h"
+  "faketime faketime"
   "systemd systemd-analyze"
   "udev udevadm"
   "umockdev umockdev-run"

@@ -25,6 +25,8 @@ from gateway.faces.http.text import Format, Lines, header
 
 DEVICES_A_TURN = 8
 PIECE_BYTES = 256 * 1024
+CLOCK_STEP_S = 60.0
+"""By so much the wall clock is set; by less it is disciplined."""
 
 
 class Exposition:
@@ -35,7 +37,8 @@ class Exposition:
         self._clock = clock
         self._site = site
         self._devices = DeviceMetrics(site)
-        self._started_at = clock.wall()
+        self._began = clock.monotonic()
+        self._offset_s = clock.wall() - self._began
         self._own = OwnMetrics(site, counts, self._started_at)
         self._process = CollectorRegistry()
         ProcessCollector(registry=self._process)
@@ -47,6 +50,13 @@ class Exposition:
             self._devices = DeviceMetrics(site)
         self._site = site
         self._own = OwnMetrics(site, counts, self._started_at)
+
+    def _started_at(self) -> float:
+        """When the gateway started, by the clock as it is set now: one that was wrong then is not believed for ever."""
+        offset_s = self._clock.wall() - self._clock.monotonic()
+        if abs(offset_s - self._offset_s) > CLOCK_STEP_S:
+            self._offset_s = offset_s
+        return self._began + self._offset_s
 
     async def pieces(self, form: Format) -> AsyncIterator[bytes]:
         """The exposition in pieces of about `PIECE_BYTES`, a turn of the loop between two of them."""

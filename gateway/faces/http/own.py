@@ -235,8 +235,8 @@ class Counts:
 class OwnMetrics:
     """The gateway's own metrics, each line and counter read once a scrape."""
 
-    def __init__(self, site: Site, counts: Counts, started_at: float) -> None:
-        """`started_at` is wall time."""
+    def __init__(self, site: Site, counts: Counts, started_at: Callable[[], float]) -> None:
+        """`started_at` gives the wall time of the start, by the clock as it is set now."""
         self._counts = counts
         self._started_at = started_at
         self._lines = [Source.labelled(line, LINE_LABELS, (line.name, site.of_line(line.name))) for line in site.lines]
@@ -246,7 +246,7 @@ class OwnMetrics:
         """Each family that has samples, with its lines."""
         counts = self._counts
         lines = [Source(LineView(line.of, line.of.status(now)), line.labels, line.written) for line in self._lines]
-        yield from families(GATEWAY_RULES, [Source(GatewayView(self._started_at, not counts.not_ready()))])
+        yield from families(GATEWAY_RULES, [Source(GatewayView(self._started_at(), not counts.not_ready()))])
         if counts.service is not None:
             yield from families(SERVICE_RULES, [Source(counts.service)])
         yield from families(LINE_RULES, lines)
