@@ -59,14 +59,17 @@ class Note:
 class Delivery:
     """The notifications of one receiver. `waiting` is how many conditions there may be something to tell of."""
 
-    def __init__(self, receiver: Receiver, writer: PduWriter, stats: NotifyStats, now: float) -> None:
+    def __init__(
+        self, receiver: Receiver, writer: PduWriter, stats: NotifyStats, now: float, *, cold: bool = True
+    ) -> None:
+        """`cold`: the gateway has just been started, and the receiver is to know it."""
         self.stats = stats
         self._inform = receiver.inform
         self._writer = writer
         self._announcer = Announcer(hold_s=receiver.hold_s, least=receiver.least)
         self._interval_s = 60.0 / receiver.per_minute
         self._bucket = Bucket(receiver.per_minute / 60.0, _BURST_S, now)
-        self._standard: dict[Oid, None] = {notifications.COLD_START: None}
+        self._standard: dict[Oid, None] = {notifications.COLD_START: None} if cold else {}
         self._under_way: dict[int, Note] = {}
         self._sequence = 0
         self._request_id = secrets.randbits(31)

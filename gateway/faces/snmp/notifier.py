@@ -60,7 +60,8 @@ class Notifier:
                 continue
             stats = NotifyStats(receiver.label, "inform" if receiver.inform else "trap")
             writer = PduWriter(layout, site, ticks, inform=receiver.inform)
-            self._posts.append(_Post(receiver, Delivery(receiver, writer, stats, now), clock))
+            delivery = Delivery(receiver, writer, stats, now, cold=before is None)
+            self._posts.append(_Post(receiver, delivery, clock))
 
     @property
     def stats(self) -> Sequence[NotifyStats]:

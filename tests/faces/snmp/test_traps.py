@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import replace
@@ -16,7 +17,9 @@ from gateway.core.site import Device, LineState, Site
 from gateway.core.snapshot import DeviceState
 from gateway.core.stats import ModbusServerStats
 from gateway.devices.model import DeviceMap
+from gateway.faces.snmp import notifier
 from gateway.faces.snmp.agent import SnmpAgent
+from gateway.faces.snmp.notifier import Notifier
 from gateway.faces.snmp.secret import Secret
 from gateway.faces.snmp.settings import Receiver, SnmpSettings
 from tests.faces.snmp.poller import a_user, credentials
@@ -272,3 +275,47 @@ async def test_a_receiver_that_does_not_know_the_user_is_named(
     assert set(gateway.stats.refused) == {"user"}
     assert f'event=notify_refused receiver=127.0.0.1:{scene.port} reason="user"' in caplog.text
     assert gateway.stats.acknowledged == 0
+
+
+async def test_a_receiver_that_comes_later_is_not_told_that_the_gateway_started(scene: Scene) -> None:
+    gateway = scene.gateway()
+    ours = gateway.agent
+    async with scene.trapd(COMMUNITY) as there:
+        later = Notifier(
+            (receiver("inform", "v2c", scene.port),),
+            ours.layout,
+            site="ridge-07",
+            clock=gateway.clock,
+            engine=ours.engine,
+            ticks=lambda at: int(at * 100),
+            before=ours.notifier,
+        )
+        task = asyncio.create_task(later.run())
+        gateway.shows(array_faults=1)
+        later.changed(tuple(gateway.conditions.active()), gateway.clock.monotonic())
+        got = await there.next()
+        assert (got.name, got.objects["pgwNotifySequence"]) == ("pgwConditionRaised", "Gauge32: 1")
+        task.cancel()
+        await asyncio.wait([task])
+
+
+async def test_an_address_that_cannot_be_reached_is_tried_until_it_can(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    way = notifier._Post._open
+    failures = 2
+
+    def opened(post: notifier._Post) -> socket.socket:
+        nonlocal failures
+        failures -= 1
+        if failures >= 0:
+            raise OSError(101, "Network is unreachable")
+        return way(post)
+
+    monkeypatch.setattr(notifier._Post, "_open", opened)
+    monkeypatch.setattr(notifier, "OPEN_AGAIN_S", 0.01)
+    gateway = scene.gateway()
+    async with scene.trapd(COMMUNITY) as there, gateway.running():
+        assert (await there.next()).name == COLD_START
+    assert caplog.text.count('reason="Network is unreachable"') == 1
+    assert gateway.stats.failures == 0
