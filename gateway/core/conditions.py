@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from gateway.core.site import Device, LinePort, LineState, Site
-from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN, DeviceState, Snapshot
+from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN, UNKNOWN_MODEL, DeviceState, Snapshot
 from gateway.devices.model import DeviceMap, Value
 
 STALE_S = 30.0
@@ -63,6 +63,8 @@ OFFLINE = Condition(401, "offline", "controller does not answer, or not usably",
 MISMATCH = Condition(402, IDENTITY_MISMATCH, "another controller is in its place", Severity.CRITICAL)
 REWRITE = Condition(403, NOT_REWRITTEN, "slave voltage is about to expire: not rewritten in time", Severity.WARNING)
 LOAD_OFF = Condition(404, "load_disconnected", "load is disconnected by the controller", Severity.CRITICAL)
+
+MODEL = Condition(405, UNKNOWN_MODEL, "no map knows the controller: Modbus alone serves it", Severity.WARNING)
 
 HISTORY_DOWN = Condition(451, "history_store_down", "daily logs cannot be stored", Severity.WARNING)
 STATE_DIR = Condition(452, "state_dir_unusable", "state_dir is read-only or full", Severity.WARNING)
@@ -167,17 +169,25 @@ class DeviceConditions(_Set):
     def __init__(self, device: Device, now: float, changed: dict[Watch, None]) -> None:
         super().__init__(changed)
         self.device = device
+        self.map = device.map  # a model that is found later has conditions of its own
         bits: dict[str, list[tuple[int, int]]] = {}
-        for point, number, condition in bit_conditions(device.map):
+        for point, number, condition in bit_conditions(self.map):
             self._add(condition, now, device)
             bits.setdefault(point, []).append((1 << number, condition.code))
         self._bits = [(point, tuple(pairs)) for point, pairs in bits.items()]
         self._values: list[Value | None] = [None] * len(self._bits)
-        for condition in (OFFLINE, MISMATCH, REWRITE, *((LOAD_OFF,) if device.map.load is not None else ())):
+        own = [OFFLINE, MISMATCH, REWRITE]
+        own += [LOAD_OFF] if self.map.load is not None else []
+        own += [MODEL] if device.auto else []
+        for condition in own:
             self._add(condition, now, device)
         self._seen: Snapshot | None = None
         self._line_open_since: float | None = None  # None: it is down
         self._again_at: float | None = None  # when the state can change without a new snapshot
+
+    def fits(self, device: Device) -> bool:
+        """Whether these are the conditions of that device as it is now."""
+        return self.device is device and self.map is device.map
 
     def line_is(self, open_since: float | None) -> None:
         """Learn since when the line is open; None: it is down."""
@@ -209,10 +219,10 @@ class DeviceConditions(_Set):
                     self._become(code, ConditionState.RAISED if bits & mask else ConditionState.CLEAR, now)
         self._become(OFFLINE.code, self._offline(snapshot, now), now)
         heard = snapshot.last_reply_at is not None
-        for condition in (MISMATCH, REWRITE):
+        for condition in (MISMATCH, REWRITE, *((MODEL,) if self.device.auto else ())):
             raised = condition.name in snapshot.warnings
             self._become(condition.code, _state(raised if heard or raised else None), now)
-        if self.device.map.load is not None:
+        if self.map.load is not None:
             self._become(LOAD_OFF.code, self._load(shown), now)
 
     def _offline(self, snapshot: Snapshot, now: float) -> ConditionState:
@@ -231,7 +241,7 @@ class DeviceConditions(_Set):
         return self.by_code[OFFLINE.code].state
 
     def _load(self, shown: Mapping[str, Value]) -> ConditionState:
-        rule = self.device.map.load
+        rule = self.map.load
         value = None if rule is None else shown.get(rule.point)
         if rule is None or value is None:
             return ConditionState.UNKNOWN
@@ -299,7 +309,7 @@ class Conditions:
             self.gateway.go_on(before.gateway)
         self.devices: Mapping[int, DeviceConditions] = {
             device.unit_id: known[device.unit_id]
-            if device.unit_id in known and known[device.unit_id].device is device
+            if device.unit_id in known and known[device.unit_id].fits(device)
             else DeviceConditions(device, now, self._changed)
             for device in site.devices
         }

@@ -19,9 +19,19 @@ from gateway.core.scheduler import PollList
 from gateway.core.site import Device
 from gateway.core.snapshot import Block, DeviceState, Snapshot
 from gateway.devices.decode import Decoder
-from gateway.devices.model import Identification, Space, Value
+from gateway.devices.model import DeviceMap, Identification, Space, Value
 
 PartKey = tuple[Space, int, int]
+
+
+def _decoder(device: Device) -> Decoder:
+    """By the readings that were chosen; for a model that was found, those of them that it has."""
+    if not device.auto:
+        return Decoder(device.map, device.decode)
+    readings = {point.name: {reading.name for reading in point.readings} for point in device.map.points}
+    return Decoder(
+        device.map, {name: chosen for name, chosen in device.decode.items() if chosen in readings.get(name, ())}
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +57,7 @@ class DeviceRecord:
         self.rewrites: dict[str, float] = {}  # point that must be written again and again → last written
         self.live_started_at: float | None = None
         self.doubt = Doubt()
-        self._decoder = Decoder(device.map, device.decode)
+        self._decoder = _decoder(device)
         self._parts: dict[PartKey, _Part] = {}
         self._scaling: dict[str, Value] = {}  # what the device last told of it, since the line was opened
         device.snapshot = Snapshot(state_since=now)
@@ -115,6 +125,11 @@ class DeviceRecord:
     def numbered(self, serial_number: str | None, now: float) -> None:
         """The serial number was read; None when there was nothing readable."""
         self._publish(last_reply_at=now, serial_number=serial_number)
+
+    def is_of(self, device_map: DeviceMap) -> None:
+        """The device, whose model was to be found, is of this one."""
+        self.device.map = device_map
+        self._decoder = _decoder(self.device)
 
     def restart(self) -> None:
         """Another unit may stand there now: nothing of the old one is kept but what is known of its identity."""

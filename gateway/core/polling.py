@@ -12,6 +12,9 @@ Rule 4: a unit that is not the expected one is not shown and not asked for anybo
 Rule 5: blocks that the unit's product does not have, by its map, are not asked for once it told its product.
 Rule 6: a value that must be written again and again is warned about after three quarters of its time.
         It is never written by the gateway itself.
+Rule 7: a device whose model is to be found is asked who it is until it says that it is of one; from then on it is
+        as any other of that model, and never becomes one of another. While it does not, or says something that no map
+        knows, that question is what shows that it is there.
 """
 
 from __future__ import annotations
@@ -24,17 +27,23 @@ from gateway.core.health import MISSES_TO_OPEN
 from gateway.core.requests import PollItem, Purpose
 from gateway.core.settings import LineSettings
 from gateway.core.site import Device
-from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN, Block, DeviceState
+from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN, UNKNOWN_MODEL, Block, DeviceState
+from gateway.devices.agreement import map_of_product
 from gateway.devices.model import Identification, PollClass, Space
 from gateway.devices.plan import PlannedBlock, poll_plan, split
 from gateway.devices.texts import decode_text
+from gateway.devices.unknown import UNKNOWN
 from gateway.modbus.pdu import Function, ReadRequest, parse_identification, read_identification_request
 from gateway.modbus.transactions import Replied
 
 log = logging.getLogger(__name__)
 
 LOOK_AGAIN_S = 60.0
+ASK_AGAIN_S = 5.0
+"""How often a device of no known model is asked who it is."""
+
 REWRITE_WARNING_SHARE = 0.75
+_LATER = (0x05, 0x06)  # acknowledged, busy: no answer yet
 _REFUSALS_TO_SPLIT = (0x02, 0x03)
 _SMOOTHING = 0.3
 
@@ -62,8 +71,12 @@ class Polling:
         return sorted(blocks + self._once(device, now), key=_rank)
 
     def restart(self, record: DeviceRecord, now: float) -> None:
-        """Everything is read anew; blocks that were split stay split."""
+        """Everything is read anew; blocks that were split stay split, unless it was another unit that refused them."""
+        strange = IDENTITY_MISMATCH in record.device.snapshot.warnings
         record.restart()
+        if strange:
+            record.polls.items = self.first(record.device, now)
+            return
         items = [item for item in record.polls.items if item.block is not None]
         for item in items:
             item.restart(now)
@@ -79,7 +92,7 @@ class Polling:
             pdu = read_identification_request()
         else:
             space = device.map.functions[function]
-            first = next(extent.first for extent in device.map.extents if extent.space is space)
+            first = next((extent.first for extent in device.map.extents if extent.space is space), 0)
             pdu = ReadRequest(function, first, 1).encode()
         return PollItem(device, Purpose.SETTLE, pdu, None, None, now)
 
@@ -111,11 +124,14 @@ class Polling:
             item.fresh = True
             record.store(Block(block.space, block.first, block.count, event.pdu[2:], event.sent_at), now)
         elif item.purpose is Purpose.IDENTIFY:
-            record.polls.drop(item)
             objects = parse_identification(event.pdu).objects
             texts = (objects.get(number, b"").decode("ascii", "replace").strip("\0 ") for number in range(3))
             identification = Identification(*texts)
             record.identified(identification, now)
+            if record.device.map is UNKNOWN:
+                self._find(item, record, identification.product, now)
+                return
+            record.polls.drop(item)
             self._keep_what_it_has(record, identification.product)
         else:
             record.polls.drop(item)
@@ -125,6 +141,10 @@ class Polling:
         """The device answered a poll with an exception (rule 2)."""
         record.heard(now)
         block = item.block
+        if block is None and record.device.map is UNKNOWN:
+            if code not in _LATER:
+                self._find(item, record, "", now)
+            return
         if block is None:
             record.polls.drop(item)  # the device does not have it: asked once, no failure
             return
@@ -166,7 +186,7 @@ class Polling:
 
     def judge(self, record: DeviceRecord) -> DeviceState:
         """The state that follows (rule 3); the caller publishes it."""
-        live = [item for item in record.polls.items if item.block is not None and item.block.poll is PollClass.LIVE]
+        live = [item for item in record.polls.items if _shows_life(item)]
         if record.breaker.is_open:
             return DeviceState.OFFLINE
         complete = bool(live) and all(item.fresh and item.misses == 0 for item in live)
@@ -176,7 +196,7 @@ class Polling:
             if complete:
                 record.known = record.known.learned(record.seen())
             return DeviceState.ONLINE
-        asking = any(item.block is None for item in record.polls.items)
+        asking = any(item.block is None and item not in live for item in record.polls.items)
         if not complete or asking or not self._verify(record):
             return record.state
         return DeviceState.ONLINE
@@ -211,6 +231,22 @@ class Polling:
             record.known = record.known.learned(record.seen())
         return record.verified
 
+    def _find(self, item: PollItem, record: DeviceRecord, product: str, now: float) -> None:
+        """Rule 7."""
+        item.fresh = True
+        item.misses = 0
+        device_map = map_of_product(product)
+        if device_map is None or (record.known.product or product) != product:
+            if record.warn(UNKNOWN_MODEL, on=True):
+                log.warning('event=model_unknown device=%s product="%s"', record.device.name, product.replace('"', "'"))
+            return
+        record.warn(UNKNOWN_MODEL, on=False)
+        record.is_of(device_map)
+        log.info("event=model_found device=%s model=%s product=%s", record.device.name, device_map.model, product)
+        identify = Purpose.IDENTIFY
+        record.polls.items = [each for each in self.first(record.device, now) if each.purpose is not identify]
+        self._keep_what_it_has(record, product)
+
     def _keep_what_it_has(self, record: DeviceRecord, product: str) -> None:
         """Rule 5."""
         device_map = record.device.map
@@ -224,12 +260,20 @@ class Polling:
 
     def _once(self, device: Device, now: float) -> list[PollItem]:
         """What is asked once after each start: who are you."""
-        items = [PollItem(device, Purpose.IDENTIFY, read_identification_request(), None, None, now)]
+        again_s = max(self._settings.poll.live_s, ASK_AGAIN_S) if device.map is UNKNOWN else None
+        items = [PollItem(device, Purpose.IDENTIFY, read_identification_request(), None, again_s, now)]
         if device.map.identity.serial_first is not None:
             function = device.map.read_function(Space.REGISTERS)
             request = ReadRequest(function, device.map.identity.serial_first, device.map.identity.serial_words)
             items.append(PollItem(device, Purpose.SERIAL_NUMBER, request.encode(), None, None, now))
         return items
+
+
+def _shows_life(item: PollItem) -> bool:
+    """Whether its replies say that the device is there: live blocks, or who it is where nothing else is known."""
+    if item.block is None:
+        return item.purpose is Purpose.IDENTIFY and item.period_s is not None
+    return item.block.poll is PollClass.LIVE
 
 
 def _first_live(record: DeviceRecord) -> PollItem | None:

@@ -31,6 +31,7 @@ from gateway.core.policy import READ_DEVICE_IDENTIFICATION
 from gateway.core.site import Device, LineState, Outcome
 from gateway.core.snapshot import Block, DeviceState, Snapshot
 from gateway.devices.model import Extent, Space
+from gateway.devices.unknown import UNKNOWN
 from gateway.errors import DeviceOffline, IllegalDataAddress, LineDown
 from gateway.modbus.pdu import ReadRequest, is_exception, parse_read
 
@@ -64,9 +65,9 @@ class Serving:
 
     def __init__(self, device: Device, *, max_age_s: float, strict_map: bool) -> None:
         self.device = device
-        self.functions = device.map.functions
+        self.functions = device.map.functions  # those of an unknown model are those of every model
         self._max_age_s = max_age_s
-        self._strict_map = strict_map
+        self._strict_map = strict_map and device.map is not UNKNOWN  # what its ranges are, it knows alone
         self._known = {space: covered(device.map.extents, space) for space in Space}
         self._client_blocks: deque[Block] = deque(maxlen=CLIENT_BLOCKS)
         self._blocks_of: tuple[DeviceState, float] | None = None  # the stretch of being online they belong to

@@ -102,7 +102,10 @@ class LinePort(Protocol):
 
 @dataclass(slots=True, eq=False)
 class Device:
-    """A controller on a line. Only its line replaces `snapshot`."""
+    """A controller on a line. Only its line replaces `snapshot`, and `map` where it is `auto`: found by identification.
+
+    Who keeps something that follows from a map does so for the maps that its `Site` was made with.
+    """
 
     name: str
     unit_id: int
@@ -111,6 +114,7 @@ class Device:
     decode: Mapping[str, str] = field(default_factory=dict)  # point name → reading name
     expected: Identity = field(default_factory=Identity)  # what is configured of the unit itself
     reply_timeout_s: float | None = None  # None: its line's
+    auto: bool = False  # `map` is UNKNOWN until the device has said that it is of a model
     line: LinePort = field(init=False)
     snapshot: Snapshot = field(default_factory=Snapshot)
     stats: DeviceStats = field(default_factory=DeviceStats)
@@ -125,6 +129,12 @@ class Site:
     devices: tuple[Device, ...]  # ascending unit id
     by_unit: Mapping[int, Device]
     behind: Mapping[str, str] = field(default_factory=dict)  # line → the site that is behind it, where it is another
+    maps: tuple[DeviceMap, ...] = ()  # of `devices`, when the site was made
+
+    @property
+    def outdated(self) -> bool:
+        """Whether a device has another map by now."""
+        return any(device.map is not was for device, was in zip(self.devices, self.maps, strict=True))
 
     @classmethod
     def of(
@@ -136,7 +146,9 @@ class Site:
             message = "unit ids are not unique"
             raise ValueError(message)
         ordered = tuple(sorted(devices, key=lambda device: device.unit_id))
-        return cls(name, tuple(lines), ordered, MappingProxyType(by_unit), MappingProxyType(dict(behind or {})))
+        behind_of = MappingProxyType(dict(behind or {}))
+        maps = tuple(device.map for device in ordered)
+        return cls(name, tuple(lines), ordered, MappingProxyType(by_unit), behind_of, maps)
 
     def of_line(self, line: str) -> str:
         """The name of the site that a line and its devices belong to."""

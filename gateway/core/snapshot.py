@@ -15,6 +15,7 @@ from types import MappingProxyType
 from gateway.devices.model import Identification, Point, Space, Value
 
 IDENTITY_MISMATCH = "identity_mismatch"
+UNKNOWN_MODEL = "unknown_model"
 NOT_REWRITTEN = "slave_control_not_refreshed"
 """Of `Snapshot.warnings`: another unit answers; a value that must be written again and again was not in time."""
 

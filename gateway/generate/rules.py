@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN
+from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN, UNKNOWN_MODEL
 from gateway.devices.agreement import all_maps
 from gateway.devices.model import Bit, DeviceMap, Group, Point
 from gateway.generate.yaml import Node, dump
@@ -256,6 +256,14 @@ def controller_alerts() -> Iterator[Alert]:
         "critical",
         f"Nobody rewrites the slave voltage of {_AT}",
         "It must be written at least once a minute, or the controller faults and stops charging.",
+    )
+    yield Alert(
+        "MorningstarUnknownModel",
+        f'morningstar_condition{{condition="{UNKNOWN_MODEL}"}} == 1',
+        "1m",
+        "warning",
+        f"No map knows what {_AT} says that it is",
+        "Modbus TCP serves it as it is, and nothing else shows its values. The log says what it calls itself.",
     )
     for name, (low, clear, severity, wait) in BATTERY_LIMITS.items():
         alert = f"MorningstarBattery{name}"

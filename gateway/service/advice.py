@@ -12,6 +12,8 @@ from pathlib import Path
 
 from gateway.clock import SystemClock
 from gateway.core.budget import LineBudget
+from gateway.devices.schema import models
+from gateway.devices.unknown import AUTO
 from gateway.service.notify import notify_advice
 from gateway.service.schema import DOCUMENTATION_ROOT, Config, LineTable, parse_listen, parse_root
 from gateway.service.snmp import snmp_advice, snmp_on
@@ -55,6 +57,11 @@ def _lines(config: Config, budgets: Sequence[LineBudget]) -> Iterator[str]:
                 f"{path}: live values come every {budget.live_refresh_s:.1f} s, which is not within cache.max_age_s "
                 f"({config.cache.max_age_s} s): Modbus reads will have to wait for the line"
             )
+    if any(device.model == AUTO for line in config.line for device in line.device):
+        yield (
+            f'line.device.model: what "{AUTO}" stands for is known once the controller answered; one that is none of '
+            f"{', '.join(models())} is served by Modbus TCP alone, as it is"
+        )
     if config.poll.night_s is not None and config.poll.night_s >= config.cache.max_age_s > config.poll.live_s:
         yield (
             f"poll.night_s: {config.poll.night_s:g} s is not within cache.max_age_s ({config.cache.max_age_s:g} s): "

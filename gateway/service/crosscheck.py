@@ -8,13 +8,16 @@ same by a symbolic link are a matter for the lock on the port, which the running
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
+from gateway.devices.agreement import all_maps
+from gateway.devices.model import DeviceMap
 from gateway.devices.schema import load_map, models
+from gateway.devices.unknown import AUTO
 from gateway.service.emc1 import emc1_problems
 from gateway.service.notify import notify_problems
 from gateway.service.problems import Path, Problem, render_path, show, table_at
-from gateway.service.schema import NOT_SUPPORTED, Address, parse_listen
+from gateway.service.schema import Address, parse_listen
 from gateway.service.schema_tls import TlsTable
 from gateway.service.snmp import snmp_problems
 from gateway.service.writes import rule_problems
@@ -100,35 +103,36 @@ def _model(path: Path, device: Raw) -> Iterator[Problem]:
     model = device.get("model")
     if not isinstance(model, str):
         return
-    if model not in models():
-        known = ", ".join(f'"{name}"' for name in models())
-        what = f"finding the model by itself is {NOT_SUPPORTED}" if model == "auto" else f"{show(model)} has no map"
-        yield Problem((*path, "model"), f"{what}; allowed: {known}")
+    if model != AUTO and model not in models():
+        known = ", ".join(f'"{name}"' for name in (*models(), AUTO))
+        yield Problem((*path, "model"), f"{show(model)} has no map; allowed: {known}")
         return
-    yield from _identity(path, device, model)
+    maps = all_maps() if model == AUTO else (load_map(model),)
+    yield from _identity(path, device, model, maps)
     decode = device.get("decode")
     if not isinstance(decode, Mapping):
         return
-    points = {point.name: point for point in load_map(model).points if len(point.readings) > 1}
+    readings: dict[str, dict[str, None]] = {}
+    for point in (point for device_map in maps for point in device_map.points if len(point.readings) > 1):
+        readings.setdefault(point.name, {}).update(dict.fromkeys(reading.name for reading in point.readings))
     for name, reading in decode.items():
-        if name not in points:
-            text = f"no point of {model} with another reading has this name; allowed: {', '.join(points) or 'none'}"
+        if name not in readings:
+            text = f"no point of {model} with another reading has this name; allowed: {', '.join(readings) or 'none'}"
             yield Problem((*path, "decode", name), text)
-        elif isinstance(reading, str) and reading not in (names := [known.name for known in points[name].readings]):
-            allowed = ", ".join(f'"{known}"' for known in names)
+        elif isinstance(reading, str) and reading not in readings[name]:
+            allowed = ", ".join(f'"{known}"' for known in readings[name])
             yield Problem((*path, "decode", name), f"{show(reading)} is no reading of this point; allowed: {allowed}")
 
 
-def _identity(path: Path, device: Raw, model: str) -> Iterator[Problem]:
+def _identity(path: Path, device: Raw, model: str, maps: Sequence[DeviceMap]) -> Iterator[Problem]:
     """What no unit of the model can say of itself."""
-    rules = load_map(model).identity
     product = device.get("product")
-    fits = isinstance(product, str) and (product in rules.product_codes or product.startswith(rules.product_prefixes))
-    if isinstance(product, str) and not fits:
-        allowed = [*rules.product_codes, *(f"{prefix}…" for prefix in rules.product_prefixes)]
-        text = f"no {model} calls itself {show(product)}; allowed: {', '.join(allowed)}"
-        yield Problem((*path, "product"), text)
-    if isinstance(device.get("serial_number"), str) and rules.serial_first is None:
+    if isinstance(product, str) and not any(device_map.identity.names(product) for device_map in maps):
+        allowed = [code for device_map in maps for code in device_map.identity.product_codes]
+        allowed += [f"{prefix}…" for device_map in maps for prefix in device_map.identity.product_prefixes]
+        what = "known model" if model == AUTO else model
+        yield Problem((*path, "product"), f"no {what} calls itself {show(product)}; allowed: {', '.join(allowed)}")
+    if isinstance(device.get("serial_number"), str) and all(each.identity.serial_first is None for each in maps):
         text = f"a {model} tells no serial number; allowed: leave it out"
         yield Problem((*path, "serial_number"), text)
 

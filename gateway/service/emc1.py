@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 
 from gateway.devices.schema import load_map, models
+from gateway.devices.unknown import AUTO
 from gateway.faces.snmp.settings import Emc1Device
 from gateway.service.keys import parse_listen
 from gateway.service.problems import Path, Problem, show
@@ -31,6 +32,9 @@ def emc1_problems(tables: Sequence[tuple[Path, Raw]], devices: Sequence[tuple[Pa
             continue
         if unit not in known:
             yield Problem((*path, "unit_id"), f"no device has unit_id {unit}; allowed: {fitting or 'none'}")
+        elif known[unit] == AUTO:
+            text = f'the model must be named, not "{AUTO}"; allowed: {fitting or "none"}'
+            yield Problem((*path, "unit_id"), text)
         elif isinstance(known[unit], str) and known[unit] in models() and not _knows(known[unit]):
             text = f"the EMC-1 knows no {show(known[unit])}; allowed: {fitting or 'none'}"
             yield Problem((*path, "unit_id"), text)

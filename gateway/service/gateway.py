@@ -27,6 +27,7 @@ from gateway.history.source import HistorySource
 from gateway.lines.factory import Line
 from gateway.service.conditions import ConditionKeeper
 from gateway.service.config import Config
+from gateway.service.models import ModelKeeper
 from gateway.service.parts import Listener, Runnable
 from gateway.service.settings import history_settings, http_settings, line_sites, modbus_settings
 from gateway.service.snmp import snmp_settings
@@ -89,8 +90,22 @@ class Gateway:
         self._others: tuple[Runnable, ...] = (Tracer(kept.directory, lambda: self.lines, clock),)
         if systemd is not None and systemd.watchdog_s is not None:
             self._others += (Watchdog(systemd, systemd.watchdog_s, self.stuck),)
+        self.changing = asyncio.Lock()  # held from the plan of a change to its end
+        self._models = ModelKeeper(lambda: self.site, self.show_models)
         self.supervisor = Supervisor(clock, south.lines, self.listeners, self.keepers)
         self.stats.restarts = self.supervisor.restarts
+
+    async def show_models(self) -> None:
+        """Show each device by the map that it has by now: the faces are put together anew, and nothing else."""
+        async with self.changing:
+            south = South.of(self.config, self._clock, self._south)
+            now = self._clock.monotonic()
+            conditions = ConditionKeeper.of(south.site, self._history, now, self.conditions)
+            settings, history = self._snmp_settings, self._history
+            days = self._log_keeper(settings, self.config, south.site, history)
+            agent = await asyncio.to_thread(self._agent, settings, south.site, conditions, days, self._snmp)
+            access = self._http.access
+            await self.change(Plan(self.config, south, conditions, history, agent, days, access, tls=None))
 
     @property
     def lines(self) -> tuple[Line, ...]:
@@ -116,8 +131,10 @@ class Gateway:
     def keepers(self) -> tuple[Runnable, ...]:
         """What runs beside lines and listeners."""
         notifier = self._snmp.notifier
+        finding = (self._models,) if any(device.auto for device in self.site.devices) else ()
         days = () if self._days is None else (self._days,)
-        return (self._watching, *self._harvesting, *((notifier,) if notifier.stats else ()), *days, *self._others)
+        telling = (notifier,) if notifier.stats else ()
+        return (self._watching, *finding, *self._harvesting, *telling, *days, *self._others)
 
     def keep(self, keeper: Runnable) -> None:
         """Have one more keeper; before `run`."""

@@ -21,7 +21,7 @@ from gateway.clock import Clock
 from gateway.core.stats import ServiceStats
 from gateway.errors import ConfigError
 from gateway.service.changes import NEEDS_RESTART, changes
-from gateway.service.config import load_config
+from gateway.service.config import Config, load_config
 from gateway.service.garbage import set_aside
 from gateway.service.gateway import Gateway
 from gateway.service.logs import Log
@@ -71,15 +71,11 @@ class Reloader:
             for key in (key for key in NEEDS_RESTART if getattr(config, key) != getattr(before, key)):
                 _log.warning("event=reload_needs_restart key=%s kept=old", key)
             config = config.model_copy(update={key: getattr(before, key) for key in NEEDS_RESTART})
-            plan = await gateway.plan(config)
+            async with gateway.changing:
+                await self._change(config)
         except ConfigError as error:
             self._refused(error.problems)
             return
-        try:
-            await gateway.change(plan)
-        except Exception:
-            gateway.supervisor.give_up(self.name)  # half of it may be done: only a new start is sure
-            raise
         self._log.use(config.log.level, config.log.form)
         self._stats.reloads["applied"] += 1
         self._stats.configured_at = self._clock.wall()
@@ -87,6 +83,14 @@ class Reloader:
         set_aside()
         changed = changes(before, config)
         _log.info('event=reloaded changed="%s" took_s=%.3f', _some(changed), self._clock.monotonic() - began)
+
+    async def _change(self, config: Config) -> None:
+        plan = await self._gateway.plan(config)
+        try:
+            await self._gateway.change(plan)
+        except Exception:
+            self._gateway.supervisor.give_up(self.name)  # half of it may be done: only a new start is sure
+            raise
 
     def _refused(self, problems: Sequence[str]) -> None:
         self._stats.reloads["refused"] += 1

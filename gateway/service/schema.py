@@ -45,7 +45,6 @@ from gateway.service.schema_tls import ROLES, Roles, TlsTable
 
 __all__ = [
     "DOCUMENTATION_ROOT",
-    "NOT_SUPPORTED",
     "Address",
     "CacheTable",
     "ClientNetworkTable",
@@ -74,7 +73,6 @@ __all__ = [
 ]
 
 PORT_SCHEMES = ("rfc2217", "socket", "tcp")
-NOT_SUPPORTED = "not supported in this version"
 
 _LINE = LineSettings(name="", index=1, port="")
 _UPSTREAM = UpstreamSettings(host="", port=0)
@@ -105,7 +103,13 @@ class DeviceTable(Table):
         int,
         Key("1 to 247", "What Modbus TCP clients ask for, and the SNMP index; unique in the gateway."),
     ] = Field(ge=1, le=247)
-    model: Annotated[str, Key("a model with a map", "The map by which its registers are read.")]
+    model: Annotated[
+        str,
+        Key(
+            'a model with a map, or "auto"',
+            "The map by which its registers are read; auto: that of the product it says it is.",
+        ),
+    ]
     decode: Annotated[
         dict[str, str],
         Key(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -11,7 +12,10 @@ from gateway.core.identity import Identity
 from gateway.core.ratelimit import ClientRate, LineRates
 from gateway.core.settings import LineSettings, PollSettings, UpstreamSettings
 from gateway.core.site import Device
+from gateway.devices.agreement import all_maps
+from gateway.devices.model import DeviceMap
 from gateway.devices.schema import load_map
+from gateway.devices.unknown import AUTO, UNKNOWN
 from gateway.faces.http.settings import HttpSettings
 from gateway.faces.modbus.settings import LineListen, ModbusSettings, Network, RateSettings
 from gateway.history.settings import HistorySettings
@@ -74,7 +78,8 @@ def line_devices(line: LineTable) -> tuple[Device, ...]:
             name=device.name,
             unit_id=device.unit_id,
             address=device.address,
-            map=load_map(device.model),
+            map=UNKNOWN if device.model == AUTO else load_map(device.model),
+            auto=device.model == AUTO,
             decode=dict(device.decode),
             expected=Identity(product=device.product, serial_number=device.serial_number),
             reply_timeout_s=device.reply_timeout_s,
@@ -83,12 +88,22 @@ def line_devices(line: LineTable) -> tuple[Device, ...]:
     )
 
 
+def maps_of(model: str) -> tuple[DeviceMap, ...]:
+    """The maps that a configured model stands for: every one where it is to be found."""
+    return all_maps() if model == AUTO else (load_map(model),)
+
+
+def _heaviest(maps: Sequence[DeviceMap], settings: LineSettings) -> DeviceMap:
+    """The one whose polls take most of a line's time: what a model that is still to be found may take."""
+    return max(maps, key=lambda device_map: line_budget(settings, [device_map]).use_ratio or 0.0)
+
+
 def line_budgets(config: Config) -> tuple[LineBudget, ...]:
     """What each line can carry, in the order of the file."""
     return tuple(
         line_budget(
             settings,
-            [load_map(device.model) for device in line.device],
+            [_heaviest(maps_of(device.model), settings) for device in line.device],
             timeouts_s=[device.reply_timeout_s for device in line.device if device.reply_timeout_s is not None],
         )
         for settings, line in zip(line_settings(config), config.line, strict=True)

@@ -67,7 +67,7 @@ class South:
 
 
 def _alike(name: str, behind: dict[str, str], built: list[Built], before: South) -> bool:
-    """Whether it is the same site: the same lines in the same places, under the same name."""
+    """Whether it is the same site: the same lines in the same places, under the same name, no model found meanwhile."""
     places = [(each.line, each.settings.index) for each in built]
-    same = name == before.site.name and behind == before.site.behind
+    same = not before.site.outdated and name == before.site.name and behind == before.site.behind
     return same and places == [(each.line, each.settings.index) for each in before.built]

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path as FilePath
 
 from gateway.core.site import Device
 from gateway.core.write_rules import Network, Range, WriteRule, WriteRules
 from gateway.core.write_wear import WearLimits
+from gateway.devices.agreement import all_maps
 from gateway.devices.model import Access, DeviceMap, Point, Space
 from gateway.devices.schema import load_map, models
+from gateway.devices.unknown import AUTO
 from gateway.faces.modbus.settings import WriteSettings
 from gateway.service.problems import Path, Problem, show
 from gateway.service.schema import Config, WriteTable, parse_range
@@ -35,12 +37,16 @@ def write_settings(config: Config) -> WriteSettings | None:
 
 def line_writes(rules: Sequence[WriteRule], devices: Sequence[Device]) -> bool:
     """Whether a line with these devices ever has a write to send."""
-    return any(WriteRules(rules, device) for device in devices)
+    return any(
+        WriteRules(rules, device) or (device.auto and any(rule.allowed(each) for rule in rules for each in all_maps()))
+        for device in devices
+    )
 
 
 def rule_problems(tables: Sequence[tuple[Path, Raw]], devices: Sequence[Raw]) -> Iterator[Problem]:
     """What is wrong with `[[modbus.write]]` tables, beyond the form; `devices`: the raw `[[line.device]]` tables."""
-    known = [device for device in devices if device.get("model") in models() and isinstance(device.get("unit_id"), int)]
+    named = {*models(), AUTO}
+    known = [device for device in devices if device.get("model") in named and isinstance(device.get("unit_id"), int)]
     for path, table in tables:
         wanted = table.get("unit_id")
         chosen = [device for device in known if not isinstance(wanted, list) or device["unit_id"] in wanted]
@@ -49,7 +55,7 @@ def rule_problems(tables: Sequence[tuple[Path, Raw]], devices: Sequence[Raw]) ->
                 units = ", ".join(str(device["unit_id"]) for device in known)
                 yield Problem((*path, "unit_id", index), f"no device has unit id {unit}; allowed: {units or 'none'}")
         if chosen:
-            maps = [load_map(model) for model in dict.fromkeys(str(device["model"]) for device in chosen)]
+            maps = _maps(str(device["model"]) for device in chosen)
             yield from _named(path, table, maps)
             yield from _ranges(path, table, maps)
         if not any(table.get(key) for key in ("source", "role")):
@@ -67,7 +73,7 @@ def write_advice(config: Config) -> Iterator[str]:
         return
     if not modbus.write:
         yield "modbus.writes: there is no [[modbus.write]] rule, so nobody may write"
-    maps = [load_map(device.model) for line in config.line for device in line.device]
+    maps = _maps(device.model for line in config.line for device in line.device)
     for index, table in enumerate(modbus.write):
         path = f"modbus.write[{index}]"
         for number, text in enumerate(table.source):
@@ -86,6 +92,12 @@ def write_advice(config: Config) -> Iterator[str]:
         )
         if left_out:
             yield f"{path}: to be written, these must be named in point, whatever the ranges: {', '.join(left_out)}"
+
+
+def _maps(models_of: Iterable[str]) -> list[DeviceMap]:
+    """The maps of these configured models, each once; of one that is to be found, all."""
+    wanted = list(dict.fromkeys(models_of))
+    return list(all_maps()) if AUTO in wanted else [load_map(model) for model in wanted]
 
 
 def _rule(table: WriteTable) -> WriteRule:

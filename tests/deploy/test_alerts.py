@@ -30,6 +30,13 @@ def battery(volts: str, multiplier: int) -> list[dict[str, str]]:
     ]
 
 
+def tristar_battery(volts: str, highest: str) -> list[dict[str, str]]:
+    return [
+        series("morningstar_battery_voltage_slow_60s_volts", volts),
+        series("morningstar_battery_voltage_maximum_volts", f"{highest}x200"),
+    ]
+
+
 def by_day(array: str, current: str, **states: str) -> list[dict[str, str]]:
     return [
         series("morningstar_array_voltage_volts", array),
@@ -136,6 +143,32 @@ SCENARIOS = (
         [series("morningstar_condition", "0x5 1x5 0x5", condition="slave_control_not_refreshed")],
         {5: 0, 7: 1, 13: 0},
         "critical",
+    ),
+    Scenario(
+        "MorningstarUnknownModel",
+        [
+            series("morningstar_condition", "0x5 1x10 0x5", condition="unknown_model"),
+            series("morningstar_condition", "0x20", PEER, condition="unknown_model"),
+        ],
+        {5: 0, 8: 1, 14: 1, 18: 0},
+        "warning",
+    ),
+    # 48 V, of a controller that tells no multiplier but the highest voltage that it has seen
+    Scenario("MorningstarBatteryLow", tristar_battery("48.5x20 47.2x40", "59.6"), {15: 0, 35: 1, 55: 1}, "warning"),
+    Scenario("MorningstarBatteryLow", tristar_battery("24.5x20 23.6x40", "29.8"), {15: 0, 35: 1}, "warning"),
+    Scenario("MorningstarBatteryLow", tristar_battery("12.3x20 11.8x40", "14.9"), {15: 0, 35: 1}, "warning"),
+    Scenario("MorningstarBatteryVeryLow", tristar_battery("47x20 46x15 47x5", "59.6"), {15: 0, 30: 1}, "critical"),
+    Scenario(
+        "MorningstarNoChargeByDay",
+        [
+            *tristar_battery("50x200", "59.6"),
+            series("morningstar_array_voltage_volts", "70x200"),
+            series("morningstar_battery_voltage_volts", "50x200"),
+            series("morningstar_charge_current_amperes", "0x200"),
+            series("morningstar_charge_state", "1x200", state="mppt"),
+        ],
+        {30: 0, 70: 1},
+        "warning",
     ),
     # 12 V: fires below 11.9, ends above 12.1, and one step of a half-precision float (7.8 mV) changes nothing
     Scenario("MorningstarBatteryLow", battery("12x20 11.95x40", 1), {15: 0, 55: 0}, "warning"),

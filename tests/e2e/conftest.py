@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pytest
 
-from tests.e2e.programs import DEMO_DEVICES, GATEWAY, Launch, Program, Running, Start, wait_until, write_config
+from tests.e2e.programs import DEMO_DEVICES, GATEWAY, MODELS, Launch, Program, Running, Start, wait_until, write_config
 
 
 @pytest.fixture
@@ -35,13 +35,15 @@ def launch(tmp_path: Path, start: Start, free_tcp_port: Callable[[], int], free_
         line_keys: str = "",
         rest: str = "",
         modbus_keys: str = "",
+        *,
+        models: Mapping[str, str] = MODELS,
     ) -> Running:
         simulator = None
         if simulate is not None:
             simulator = start(*GATEWAY, "simulate", "--link-dir", str(tmp_path), *simulate)
             wait_until(lambda: any(path.is_symlink() for path in tmp_path.iterdir()), "the simulated lines")
         ports = (free_tcp_port(), free_udp_port(), free_tcp_port())
-        write_config(tmp_path / "site.toml", ports, devices, line_keys, rest, modbus_keys=modbus_keys)
+        write_config(tmp_path / "site.toml", ports, devices, line_keys, rest, modbus_keys=modbus_keys, models=models)
         gateway = start(*GATEWAY, "run", "-c", str(tmp_path / "site.toml"))
         return Running(tmp_path, *ports, gateway, simulator)
 

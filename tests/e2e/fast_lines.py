@@ -1,7 +1,8 @@
 """The demo's four controllers on two ptys at 115200 8N2: `simulate --oracle`, twelve times as fast.
 
 Reading all registers of the controllers twice takes minutes at 9600 baud; what a register holds is the same.
-With `plants` behind the folder they are `simulate` without `--oracle`: a solar day, and a daily log.
+With `plants` behind the folder they are `simulate` without `--oracle`: a solar day, and a daily log. With `stranger`
+there is one more, at address 3 of shelter-b, that calls itself something that no map knows.
 """
 
 from __future__ import annotations
@@ -38,6 +39,14 @@ def controllers() -> dict[str, list[OracleController]]:
     return found
 
 
+class Stranger(OracleController):
+    """A controller of another maker's mind."""
+
+    def identification(self) -> Mapping[int, bytes]:
+        """What no map knows."""
+        return {**super().identification(), 1: b"SS-MPPT-15L"}
+
+
 def plants() -> dict[str, list[SimulatedController]]:
     """The same with a plant each."""
     site = SimulatedSite.build(load_map("prostar-mppt"))
@@ -65,4 +74,9 @@ async def run(folder: Path, stations_of: Mapping[str, Sequence[Station]]) -> Non
 
 
 if __name__ == "__main__":
-    asyncio.run(run(Path(sys.argv[1]), plants() if "plants" in sys.argv else controllers()))
+    chosen: dict[str, list[Station]] = {
+        name: [*stations] for name, stations in (plants() if "plants" in sys.argv else controllers()).items()
+    }
+    if "stranger" in sys.argv:
+        chosen["shelter-b"].append(Stranger(load_map("prostar-mppt"), device=9, address=3))
+    asyncio.run(run(Path(sys.argv[1]), chosen))

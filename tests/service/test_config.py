@@ -161,7 +161,7 @@ port = "/dev/b"
 name = "y"
 address = "1"
 unit_id = 11
-model = "auto"
+model = "automatic"
 [poll]
 live_s = true
 [modbus]
@@ -292,10 +292,21 @@ listen = ["127.0.0.1:70000"]
             "snmp.community[0].name: the value is not allowed; allowed: 1 to 32 printable ASCII",
         ),
         (MINIMAL + '[[snmp.community]]\nname = "a"\nsource = []\n', "snmp.community[0].source: is empty; allowed:"),
-        (replaced('model = "prostar-mppt"', 'model = "auto"'), "finding the model by itself is not supported in this"),
+        (
+            replaced('model = "prostar-mppt"', 'model = "auto"\nproduct = "PWM-1"'),
+            'line[0].device[0].product: no known model calls itself "PWM-1"; allowed: PS-MPPT-25, ',
+        ),
+        (
+            replaced('model = "prostar-mppt"', 'model = "auto"\ndecode = { hourmeter = "f16" }'),
+            'line[0].device[0].decode.hourmeter: "f16" is no reading of this point; allowed: "document", "lo_hi"',
+        ),
+        (
+            replaced('model = "prostar-mppt"', 'model = "auto"\ndecode = { battery_voltage = "f16" }'),
+            "line[0].device[0].decode.battery_voltage: no point of auto with another reading has this name; allowed: ",
+        ),
         (
             replaced('model = "prostar-mppt"', 'model = "prostar"'),
-            'line[0].device[0].model: "prostar" has no map; allowed: "prostar-mppt"',
+            'line[0].device[0].model: "prostar" has no map; allowed: "prostar-mppt", "tristar-mppt", "auto"',
         ),
         (
             replaced('"/dev/serial/by-id/usb-a"', '"tcp://10.0.0.1:502"\nbaudrate = 19200'),

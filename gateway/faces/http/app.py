@@ -80,6 +80,11 @@ class HttpFace:
         self.listeners: Sequence[HttpListener] = ()
         self.listeners = self._listeners()
 
+    @property
+    def access(self) -> Access:
+        """The credentials that it goes by."""
+        return self._access
+
     def adjust(
         self,
         settings: HttpSettings,

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from gateway.core.site import Device, Site
-from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN, DeviceState, Snapshot
+from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN, UNKNOWN_MODEL, DeviceState, Snapshot
 from gateway.devices.model import DeviceMap, Kind, Point, Value
 from gateway.errors import MapError
 from gateway.faces.http.metric import Labels, MetricInfo, MetricKind, gauge
@@ -28,7 +28,7 @@ from gateway.faces.http.text import Lines, escaped, label_pairs, number, sample_
 DEVICE_LABELS = ("device", "line", "model", "site", "unit_id")
 """Every metric of a device has these labels, first and in this order."""
 
-CONDITIONS = (IDENTITY_MISMATCH, NOT_REWRITTEN)
+CONDITIONS = (IDENTITY_MISMATCH, NOT_REWRITTEN, UNKNOWN_MODEL)
 """Conditions that have a series from the start, so that the first time is a rise."""
 
 UP = gauge("morningstar_up", "1 while the controller is online, 0 while it is not.", *DEVICE_LABELS)

@@ -62,8 +62,8 @@ async def test_openmetrics_on_request_has_the_same_samples(gateway: Gateway) -> 
 
     assert devices(plain) == devices(parse_openmetrics(text))
     assert (
-        len(devices(plain)) == 22
-    )  # 1 + 1 + 2 + 2 series of values; per device up, 4 states, 2 conditions; one age, one info
+        len(devices(plain)) == 24
+    )  # 1 + 1 + 2 + 2 series of values; per device up, 4 states, 3 conditions; one age, one info
 
 
 async def test_gzip_when_the_client_takes_it(gateway: Gateway) -> None:

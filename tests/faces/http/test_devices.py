@@ -138,7 +138,12 @@ def test_conditions_are_told_whatever_the_state(exposition: Exposition, site: Si
     found = {
         key[2]: value for key, value in samples(exposition).items() if key[:2] == ("morningstar_condition", "array-2")
     }
-    assert found == {"identity_mismatch": 1, "slave_control_not_refreshed": 0, "of_tomorrow": 1}
+    assert found == {
+        "identity_mismatch": 1,
+        "slave_control_not_refreshed": 0,
+        "unknown_model": 0,
+        "of_tomorrow": 1,
+    }
 
 
 @pytest.mark.parametrize("model", models())
