@@ -29,6 +29,7 @@ import socket
 from collections.abc import Sequence
 from functools import partial
 from random import Random
+from typing import cast
 
 from gateway.clock import Clock
 from gateway.core.budget import GRACE_S
@@ -310,8 +311,7 @@ class _Connection(asyncio.Protocol):
         self.error: Exception | None = None  # a bug that ended it
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
+        self._transport = cast("asyncio.Transport", transport)  # uvloop's is none by its class
 
     def data_received(self, data: bytes) -> None:
         self._line.on_bytes(self, data)

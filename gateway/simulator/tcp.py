@@ -6,7 +6,7 @@ import asyncio
 import socket
 import struct
 from types import TracebackType
-from typing import Self
+from typing import Self, cast
 
 from gateway.clock import Clock, SystemClock
 from gateway.simulator.upstream import ServerConnection, SimulatedServer
@@ -82,8 +82,7 @@ class _Peer(asyncio.Protocol):
         self._timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
+        self._transport = cast("asyncio.Transport", transport)  # uvloop's is none by its class
         if self._owner.server.refusing:
             self.reset()
             return

@@ -84,6 +84,21 @@ async def test_values_come_over_ipv4_ipv6_and_by_name(host: str) -> None:
         assert server.server.counters.most_waiting > 1, "requests are pipelined"
 
 
+def test_it_runs_on_uvloop() -> None:
+    uvloop = pytest.importorskip("uvloop")
+    for habits in (Habits(), Habits(closes=True)):
+        uvloop.run(online_once(habits))
+
+
+async def online_once(habits: Habits) -> None:
+    units = devices(2)
+    server = TcpServer(SimulatedServer(controllers(2), habits=habits))
+    async with server, running(line_to("127.0.0.1", server.port, units)) as line:
+        await until(lambda: all_online(units))
+        for k in range(10):
+            assert isinstance(await ask(line, units[k % 2]), bytes)
+
+
 async def test_a_server_that_closes_after_every_reply_gives_no_error_and_no_pause() -> None:
     units = devices(2)
     simulated = SimulatedServer(controllers(2), habits=Habits(closes=True))
