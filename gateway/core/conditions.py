@@ -61,7 +61,7 @@ class Condition:
 
 OFFLINE = Condition(401, "offline", "controller does not answer, or not usably", Severity.CRITICAL)
 MISMATCH = Condition(402, IDENTITY_MISMATCH, "another controller is in its place", Severity.CRITICAL)
-REWRITE = Condition(403, NOT_REWRITTEN, "slave voltage is about to expire: not rewritten in time", Severity.WARNING)
+REWRITE = Condition(403, NOT_REWRITTEN, "slave voltage is about to expire: not rewritten in time", Severity.CRITICAL)
 LOAD_OFF = Condition(404, "load_disconnected", "load is disconnected by the controller", Severity.CRITICAL)
 
 MODEL = Condition(405, UNKNOWN_MODEL, "no map knows the controller: Modbus alone serves it", Severity.WARNING)

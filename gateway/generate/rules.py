@@ -220,6 +220,23 @@ LINE_ALERTS: tuple[Alert, ...] = (
         "The log is never read ahead of a poll or a client, so on a line without idle time it is not read at all; the "
         "controller keeps 256 days. Poll less often (poll.live_s, or poll.night_s for the nights).",
     ),
+    Alert(
+        "ProstarStateDirUnusable",
+        'prostar_gateway_condition{condition="state_dir_unusable"} == 1',
+        "5m",
+        "warning",
+        "The gateway {{ $labels.instance }} cannot write to its state_dir",
+        "Read-only or full. Live data goes on; daily logs are not stored, and writes to controllers are refused.",
+    ),
+    Alert(
+        "ProstarReceiverSilent",
+        "prostar_gateway_snmp_receiver_silent == 1",
+        "10m",
+        "warning",
+        "The gateway {{ $labels.instance }} tells {{ $labels.receiver }} of conditions, and it does not acknowledge",
+        "Informs go on to be sent, and the receiver gets what holds when it is back. The log says whether it refuses "
+        "them.",
+    ),
 )
 
 

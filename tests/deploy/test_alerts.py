@@ -92,6 +92,18 @@ SCENARIOS = (
         "ProstarHistoryStoreFailing", [series("prostar_gateway_history_store_up", "1x5 0x20", TARGET)], {5: 0, 12: 1}
     ),
     Scenario(
+        "ProstarStateDirUnusable",
+        [series("prostar_gateway_condition", "0x5 1x20", TARGET, condition="state_dir_unusable")],
+        {5: 0, 12: 1},
+        "warning",
+    ),
+    Scenario(
+        "ProstarReceiverSilent",
+        [series("prostar_gateway_snmp_receiver_silent", "0x5 1x20 0x5", TARGET, receiver="192.0.2.7:162")],
+        {5: 0, 20: 1, 28: 0},
+        "warning",
+    ),
+    Scenario(
         "ProstarHistoryLate",
         [series("prostar_gateway_history_last_harvest_age_seconds", "259000+60x100"), UP],
         {1: 0, 60: 0, 80: 1},
