@@ -36,9 +36,9 @@ class Oracle:
 
     def __init__(self, tree: Tree, view: View, now: float) -> None:
         shown = [cell for cell in tree if view.shows(cell.oid)]
-        found = [(cell.oid, encoded(cell.object.syntax, cell.object.get(cell.row, now))) for cell in shown]
-        self._cells = sorted((oid, value) for oid, value in found if value is not None)
-        self._oids = [oid for oid, _ in self._cells]
+        found = [(cell.oid, cell.object.syntax, cell.object.get(cell.row, now)) for cell in shown]
+        self._cells = {oid: (syntax, value) for oid, syntax, value in found if value is not None}
+        self._oids = sorted(self._cells)
 
     def ask(self, kind: type, names: Sequence[Oid], bulk: tuple[int, int]) -> Pairs:
         """All varbinds of the response, however many octets they take."""
@@ -58,22 +58,19 @@ class Oracle:
         return pairs
 
     def _get(self, name: Oid) -> tuple[Oid, bytes]:
-        at = bisect_right(self._oids, name) - 1
-        if at >= 0 and self._oids[at] == name:
-            return self._cells[at]
-        return name, MISSING
+        return name, encoded(*self._cells[name]) if name in self._cells else MISSING
 
     def _next(self, name: Oid) -> tuple[Oid, bytes]:
         at = bisect_right(self._oids, name)
-        return self._cells[at] if at < len(self._oids) else (name, END_OF_MIB_VIEW)
+        if at == len(self._oids):
+            return name, END_OF_MIB_VIEW
+        found = self._oids[at]
+        return found, encoded(*self._cells[found])
 
 
-def encoded(syntax: Syntax, value: CellValue) -> bytes | None:
+def encoded(syntax: Syntax, value: CellValue) -> bytes:
     """A value by pysnmp's classes."""
-    if value is None:
-        return None
-    wraps = syntax in {Syntax.COUNTER32, Syntax.TIME_TICKS, Syntax.TIME_STAMP}
-    if wraps:
+    if syntax in {Syntax.COUNTER32, Syntax.TIME_TICKS, Syntax.TIME_STAMP}:
         assert isinstance(value, int)
         value %= 2**32
     octets: bytes = encoder.encode(TYPES[syntax](value))

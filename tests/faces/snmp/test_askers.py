@@ -109,6 +109,31 @@ def test_cut_and_changed_messages_are_not_opened(secured: SnmpAgent, clock: Stub
         assert security(secured).open_known(changed, NAMES, clock.now) is None
 
 
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150)
+@given(data=st.data())
+def test_authentic_but_odd_messages_are_opened_as_by_the_long_way_or_left_to_it(
+    secured: SnmpAgent, clock: StubClock, data: st.DataObject
+) -> None:
+    """A user may send what he likes, well signed: lengths in more octets than needed, other tags, other sizes."""
+    poller = signed_in(secured)
+    message = bytearray(poller.sealed(pdu(v2c.GetRequestPDU, SYS_DESCR)))
+    mac_at = v3.parse(bytes(message), reader.version(bytes(message))[2]).mac_at
+    assert poller.user is not None
+    mac = poller.user.mac
+    for _ in range(data.draw(st.integers(1, 2))):
+        at = data.draw(st.integers(0, len(message) - 1).filter(lambda at: not mac_at <= at < mac_at + mac.size))
+        message[at] = data.draw(st.one_of(st.integers(0, 255), st.sampled_from([message[at] + 1 & 255, 0x81, 0x30])))
+    message[mac_at : mac_at + mac.size] = mac.blank
+    message[mac_at : mac_at + mac.size] = mac.of(bytes(message))
+    signed = bytes(message)
+    quick = security(secured).open_known(signed, NAMES, clock.now)
+    if quick is None:
+        return
+    right = security(secured).open(v3.parse(signed, reader.version(signed)[2]), NAMES, clock.now)
+    for field in ("user", "message_id", "flags", "plain", "context", "pdu_at", "room"):
+        assert getattr(quick, field) == getattr(right, field), field
+
+
 def test_what_is_remembered_is_bounded_and_the_newest_stays(secured: SnmpAgent, clock: StubClock) -> None:
     poller = signed_in(secured)
     known = security(secured)._askers._known
