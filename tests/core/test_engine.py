@@ -490,3 +490,19 @@ def test_other_queue_limits_hold_from_now_on(virtual_line: MakeLine) -> None:
         line.read(line.devices[0], registers(address, 2), outcomes.append)
     line.run(5.0)
     assert sum(isinstance(outcome, QueueFull) for outcome in outcomes) == 2
+
+
+def test_after_a_suspend_or_497_days_there_is_one_round_of_polls_and_no_burst(virtual_line: MakeLine) -> None:
+    line = virtual_line(Registers(1), Registers(2))
+    line.run(30.0)
+    before = len(line.sent)
+    line.run(10.0)
+    usual = len(line.sent) - before
+    for slept_s in (3600.0, 2**32 / 100):
+        line.now += slept_s  # nobody called: the machine slept, or the test does not want to wait
+        before = len(line.sent)
+        line.run(10.0)
+        round_of_settings = 40
+        assert usual - 5 <= len(line.sent) - before <= usual + round_of_settings
+        assert [device.snapshot.state for device in line.devices] == [DeviceState.ONLINE] * 2
+        assert all(line.now - at < 11.0 for device in line.devices for at in device.snapshot.read_at.values())

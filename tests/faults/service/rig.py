@@ -38,6 +38,14 @@ class Unit(OracleController):
         """Wait until this is on the wire."""
         await until(lambda: pdu in self.asked)
 
+    async def is_quiet(self) -> None:
+        """Wait until the polls of the start are over, so that the next request on the line is a client's."""
+        async with asyncio.timeout(30):
+            count = -1
+            while count != len(self.asked):
+                count = len(self.asked)
+                await asyncio.sleep(0.5)
+
 
 class NotifySocket:
     """The socket on which systemd listens."""
@@ -49,7 +57,7 @@ class NotifySocket:
         self.path = str(path)
         self.told: list[str] = []
 
-    async def next(self, beginning: str, timeout_s: float = 15.0) -> str:
+    async def next(self, beginning: str, timeout_s: float = 40.0) -> str:
         """The next message that begins so."""
         async with asyncio.timeout(timeout_s):
             while True:
@@ -111,13 +119,13 @@ class Service:
         """The running gateway as the end-to-end tests see it."""
         return Running(self.folder, *self.ports, self.programs[-1], None)
 
-    async def log(self, pattern: str, timeout_s: float = 15.0) -> str:
+    async def log(self, pattern: str, timeout_s: float = 40.0) -> str:
         """The next line of the log that matches."""
         return await asyncio.to_thread(self.programs[-1].wait_for, pattern, timeout_s)
 
     async def online(self, *devices: str) -> None:
         """Wait until these devices, or all, are online."""
-        await asyncio.to_thread(self.site.wait_online, *devices)
+        await asyncio.to_thread(self.site.wait_online, *devices, timeout_s=60.0)
 
     async def get(self, path: str) -> tuple[int, str]:
         """Status and text of an HTTP reply."""
@@ -185,7 +193,7 @@ async def client(port: int) -> AsyncIterator[Client]:
             await writer.wait_closed()
 
 
-async def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> None:
+async def until(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
     """Wait for a state that only the outside world brings about."""
     async with asyncio.timeout(timeout_s):
         while not condition():  # noqa: ASYNC110 - there is no event for it

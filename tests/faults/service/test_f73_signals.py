@@ -17,6 +17,7 @@ async def test_a_second_signal_does_not_wait(service: Service, second: signal.Si
     program = service.start()
     await service.online()
     unit = service.units["shelter-a"][0]
+    await unit.is_quiet()
     unit.turnaround_s = 30.0
     async with client(service.modbus) as asker:
         asker.ask(11, read(0xE000, 2))

@@ -69,7 +69,7 @@ async def is_set(service: Service, started_at: float) -> None:
     async def seen() -> float:
         return metric((await service.get("/metrics"))[1], "prostar_gateway_start_time_seconds")
 
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(30):
         while abs(await seen() - started_at) > 30.0:  # noqa: ASYNC110 - the process has no event for it
             await asyncio.sleep(0.05)
 
