@@ -36,6 +36,7 @@ ELSEWHERE = {
     r"prometheus-snmp-exporter ": "tests/deploy/nms/test_snmp_exporter.py",
     r"(deploy/install.sh|cp site.toml /etc)": "tests/deploy/test_install.py",
     r"(apt-get install|systemctl|journalctl|editor|ls -l /dev/serial)": "tests/deploy/test_install.py",
+    r"python (-m tests.fuzz.corpus|tests/fuzz/fuzz_)": "tests/fuzz/test_fuzz.py",
     r"prostar-gateway scan ": "tests/cli/test_scan.py",
 }
 """Commands that change the machine they run on or take one with more on it, and where they are run instead."""
