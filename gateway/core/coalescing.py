@@ -56,17 +56,18 @@ def _nearest(
     span: Span, waiting: Sequence[ClientRead], *, cost: Cost, mapped: Mapped, most: Callable[[Space], int]
 ) -> tuple[Span, ClientRead] | None:
     best: tuple[float, Span, ClientRead] | None = None
+    span_s = cost(span.space, span.count)
     for read in waiting:
         other = read.span
         if other is None or other.space is not span.space:
             continue
         first, end = min(span.first, other.first), max(span.end, other.end)
-        grown = replace(span, first=first, count=end - first)
-        if grown == span:
+        count = end - first
+        if count == span.count:
             return span, read  # inside already: free, whatever the map says of it
-        saved_s = cost(span.space, span.count) + cost(span.space, other.count) - cost(span.space, grown.count)
-        if saved_s <= 0 or grown.count > most(span.space) or not mapped(span.space, first, end):
+        saved_s = span_s + cost(span.space, other.count) - cost(span.space, count)
+        if saved_s <= 0 or count > most(span.space) or not mapped(span.space, first, end):
             continue
         if best is None or saved_s > best[0]:
-            best = (saved_s, grown, read)
+            best = (saved_s, replace(span, first=first, count=count), read)
     return None if best is None else (best[1], best[2])

@@ -21,6 +21,8 @@ from gateway.core.snapshot import Block, DeviceState, Snapshot
 from gateway.devices.decode import Decoder
 from gateway.devices.model import DeviceMap, Identification, Space, Value
 
+HEARD_S = 0.05
+
 PartKey = tuple[Space, int, int]
 
 
@@ -115,8 +117,10 @@ class DeviceRecord:
         self._merge()
 
     def heard(self, now: float) -> None:
-        """The device answered something that is not a poll's block."""
-        self._publish(last_reply_at=now)
+        """The device answered something that is not a poll's block; noted to `HEARD_S`, for it makes a new snapshot."""
+        before = self.device.snapshot.last_reply_at
+        if before is None or now - before >= HEARD_S:
+            self._publish(last_reply_at=now)
 
     def identified(self, identification: Identification, now: float) -> None:
         """Read Device Identification was answered."""

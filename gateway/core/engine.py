@@ -332,7 +332,8 @@ class LineEngine:
             self._aside.forget(turn)
             if isinstance(turn, ReadTurn):
                 self._scheduler.charge(turn, seconds)
-            self._judge(record, now)
+            if error is not None or isinstance(turn, PollItem) or record.state is not DeviceState.ONLINE:
+                self._judge(record, now)  # a good answer to anybody else changes nothing
         self._watch_window(now)
 
     def _relayed(self, pdu: bytes) -> RequestError | None:

@@ -89,15 +89,23 @@ class FairQueue:
         """The read whose turn it is (rules 1 and 3) among those whose device is `ready`, or None."""
         best: tuple[float, float, str] | None = None
         best_read: ClientRead | None = None
+        known: dict[int, bool] = {}  # unit id → whether its device is ready
         for client, share in list(self._shares.items()):
             self._prune(share)
             if not share.reads:
                 if share.used_s <= self._level_s or len(self._shares) > MAX_CLIENTS:
                     del self._shares[client]
                 continue
-            read = next((r for r in share.reads if not r.started and r.wanted and ready(r.device)), None)
-            if read is None:
-                continue
+            read = share.reads[0]
+            unit = read.device.unit_id
+            if unit not in known:
+                known[unit] = ready(read.device)
+            if not known[unit]:
+                others = (r for r in share.reads if not r.started and r.wanted and ready(r.device))
+                found = next(others, None)
+                if found is None:
+                    continue
+                read = found
             rank = (share.used_s, read.queued_at, client)
             if best is None or rank < best:
                 best, best_read = rank, read

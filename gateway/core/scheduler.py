@@ -237,8 +237,10 @@ class Scheduler:
         """Whether a read of the device may begin (rule 7)."""
         if self._under_way.idle(device):
             return True
-        writes = (write for queue in self._writes.values() for write in queue)
-        return self._under_way.open(device) and not any(w.device is device and not w.waiter.left for w in writes)
+        if not self._under_way.open(device):
+            return False
+        writes = [write for queue in self._writes.values() if queue for write in queue]
+        return not writes or not any(write.device is device and not write.waiter.left for write in writes)
 
     def _read_s(self, read: ClientRead) -> float:
         return self._cost(Space.REGISTERS, 3) if read.span is None else self._cost(read.span.space, read.span.count)

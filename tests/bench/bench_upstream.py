@@ -18,19 +18,19 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parents[1]))
 
-from tests.bench.bench_line import ENVIRONMENT, free_port, modbus_proxy, running, say, table, where  # noqa: E402
+from tests.bench.bench_line import ENVIRONMENT, cpu_s, free_port, modbus_proxy, running, say, table, where  # noqa: E402
 
 CLIENTS = 16
 UNITS = (1, 2, 3, 4)
 GATEWAY_UNITS = (11, 12, 13, 14)
 LOADS = ("keeps:0", "keeps:5", "closes:0", "closes:5")
-HEAD = ("server", "replies/s", "× modbus-proxy", "p50 ms", "p99 ms", "refused", "timed out", "wrong")
+HEAD = ("server", "replies/s", "× modbus-proxy", "p50 ms", "p99 ms", "CPU µs a reply", "refused", "timed out", "wrong")
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,7 @@ class Run:
     errors: int
     timed_out: int
     wrong: int
+    cpu_us: float = 0.0  # of the server in between, a reply
 
 
 def config(folder: Path, upstream: int, port: int) -> Path:
@@ -94,6 +95,13 @@ def load(port: int, seconds: float, units: tuple[int, ...]) -> Run:
     return Run(**json.loads(done.stdout))
 
 
+def loaded(pid: int, port: int, seconds: float, units: tuple[int, ...]) -> Run:
+    """With the CPU time of that process."""
+    before_s = cpu_s(pid)
+    run = load(port, seconds, units)
+    return replace(run, cpu_us=1e6 * (cpu_s(pid) - before_s) / max(1.0, run.rate * seconds))
+
+
 @contextlib.contextmanager
 def upstream(how: Load) -> Iterator[int]:
     port = free_port()
@@ -106,9 +114,9 @@ def gateway(how: Load, seconds: float) -> Run:
     with tempfile.TemporaryDirectory(prefix="bench-") as name, upstream(how) as behind:
         port = free_port()
         command = [sys.executable, "-m", "gateway", "run", "-c", str(config(Path(name), behind, port))]
-        with running(command, port, ENVIRONMENT):
+        with running(command, port, ENVIRONMENT) as pid:
             load(port, 1.0, GATEWAY_UNITS)  # what the server stands is learnt, and everything is identified
-            return load(port, seconds, GATEWAY_UNITS)
+            return loaded(pid, port, seconds, GATEWAY_UNITS)
 
 
 def proxy(where: Path) -> Callable[[Load, float], Run]:
@@ -117,9 +125,9 @@ def proxy(where: Path) -> Callable[[Load, float], Run]:
             port = free_port()
             urls = ("-b", f"tcp://127.0.0.1:{port}", "--modbus", f"tcp://127.0.0.1:{behind}", "--timeout", "10")
             environment = {**os.environ, "PYTHONPATH": str(where)}
-            with running([sys.executable, "-m", "modbus_proxy", *urls], port, environment):
+            with running([sys.executable, "-m", "modbus_proxy", *urls], port, environment) as pid:
                 load(port, 1.0, UNITS)
-                return load(port, seconds, UNITS)
+                return loaded(pid, port, seconds, UNITS)
 
     return run
 
@@ -155,6 +163,7 @@ def row(name: str, runs: list[Run], peers: list[Run] | None) -> tuple[str, ...]:
         ratio,
         f"{statistics.median(run.p50_ms for run in runs):.2f}",
         f"{statistics.median(run.p99_ms for run in runs):.2f}",
+        "–" if not runs[0].cpu_us else f"{statistics.median(run.cpu_us for run in runs):.0f}",
         str(sum(run.errors for run in runs)),
         str(sum(run.timed_out for run in runs)),
         str(sum(run.wrong for run in runs)),
