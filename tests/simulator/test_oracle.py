@@ -6,6 +6,7 @@ import pytest
 
 from gateway.devices.decode import Decoder
 from gateway.devices.model import DeviceMap, Space
+from gateway.devices.schema import load_map
 from gateway.modbus.pdu import parse_identification, read_identification_request
 from gateway.simulator.oracle import REMEMBERED, OracleController, Verdict
 
@@ -148,3 +149,13 @@ def test_only_so_many_answers_are_remembered(prostar_map: DeviceMap) -> None:
         sampled(unit, Space.REGISTERS, 0, 2, float(k))
     assert unit.judge(Space.REGISTERS, 0, 2, first, asked_at=0.0) is Verdict.FOREIGN
     assert len(unit._numbered) == REMEMBERED
+
+
+def test_a_value_that_the_unit_scales_is_judged_by_the_scaling_in_the_same_answer() -> None:
+    unit = OracleController(load_map("tristar-mppt"), sequenced=True)
+    point = unit.map.point("battery_voltage")
+    words = unit.read(Space.REGISTERS, 0, 92, 500.0)
+    value = (words[0x19] - (words[0x19] >> 15 << 16)) / 32768 * (words[0] + words[1] / 65536)
+    assert unit.judge_value(point, value, read_at=500.0) is Verdict.RIGHT
+    assert unit.judge_value(point, value, read_at=501.0) is Verdict.LATE
+    assert unit.judge_value(point, value + 1, read_at=500.0) is Verdict.FOREIGN
