@@ -14,7 +14,7 @@ import json
 import logging
 import secrets
 from collections.abc import Callable
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
 
@@ -59,12 +59,23 @@ class AsyncStore:
         async with self._busy:
             if self._store is None and self._clock.monotonic() >= self._retry_at:
                 try:
-                    self._store = await self._in_thread(Store, self._directory, self._session)
+                    self._store = await self._open()
                 except HistoryError as error:
                     self._down(error)
                 else:
                     self._up(self._store)
             return self._store is not None
+
+    async def _open(self) -> Store:
+        """A store; one that is opened when nobody waits for it any more is closed again."""
+        if self._executor is None:
+            self._executor = self._new_executor()
+        opening = self._executor.submit(Store, self._directory, self._session)
+        try:
+            return await asyncio.wrap_future(opening)
+        except asyncio.CancelledError:
+            opening.add_done_callback(_close_opened)
+            raise
 
     async def call(self, method: Callable[Concatenate[Store, P], T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """What the method gives; HistoryError when it cannot, after which the store is down or a new one."""
@@ -131,3 +142,8 @@ class AsyncStore:
             self._executor = self._new_executor()
         call = functools.partial(function, *args, **kwargs)
         return await asyncio.get_running_loop().run_in_executor(self._executor, call)
+
+
+def _close_opened(opening: Future[Store]) -> None:
+    if not opening.cancelled() and opening.exception() is None:
+        opening.result().close()
