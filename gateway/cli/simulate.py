@@ -1,4 +1,4 @@
-"""`prostar-gateway simulate`: simulated controllers on ptys, until a signal stops it."""
+"""`prostar-gateway simulate`: simulated controllers on ptys, or behind Modbus TCP, until a signal stops it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
+from urllib.parse import urlsplit
 
 import typer
 from rich import box
@@ -19,6 +20,8 @@ from gateway.devices.schema import load_map
 from gateway.errors import MapError
 from gateway.simulator.layout import DEMO_LAYOUT, Behaviour, LinePlan, SimulatedSite
 from gateway.simulator.server import Controller
+from gateway.simulator.tcp import TcpServer
+from gateway.simulator.upstream import Habits, SimulatedServer
 
 MODEL = "prostar-mppt"
 
@@ -50,20 +53,42 @@ def command(
         bool, typer.Option("--oracle", help="Registers that encode device and address, instead of a solar day.")
     ] = False,
     model: Annotated[str, typer.Option(help="Model of the controllers for which none is named.")] = MODEL,
+    tcp: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=65535,
+            help="Instead of ptys: a Modbus TCP server a line, on 127.0.0.1 from this port on, with the controllers "
+            "on an EIA-485 bus behind it; 0 takes free ports.",
+        ),
+    ] = None,
+    close_after_reply: Annotated[
+        bool,
+        typer.Option("--close-after-reply", help="With --tcp: close a connection after each reply."),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one line of JSON instead of a table.")] = False,
 ) -> None:
-    """Run simulated controllers on ptys paced at 9600 8N2 and print where they are."""
+    """Run simulated controllers on ptys paced at 9600 8N2, or behind Modbus TCP servers, and print where they are."""
     try:
+        _check(tcp, link_dir, closes=close_after_reply)
         plans = _plans(line, lines, devices)
         behaviour = Behaviour(seed, speed, start_hour, turnaround_ms / 1000, oracle)
         site = SimulatedSite.build(load_map(model), plans, behaviour, link_dir)
     except (ValueError, MapError) as error:
         raise typer.BadParameter(str(error)) from error
     try:
-        asyncio.run(_run(site, as_json))
+        asyncio.run(_run(site, as_json) if tcp is None else _run_tcp(site, tcp, as_json, closes=close_after_reply))
     except OSError as error:
-        Console(stderr=True).print(f"cannot make a pty: {error}", markup=False)
+        what = "make a pty" if tcp is None else "listen"
+        Console(stderr=True).print(f"cannot {what}: {error}", markup=False)
         raise typer.Exit(1) from error
+
+
+def _check(tcp: int | None, link_dir: Path | None, *, closes: bool) -> None:
+    if tcp is None and closes:
+        raise ValueError("--close-after-reply needs --tcp")
+    if tcp is not None and link_dir is not None:
+        raise ValueError("--tcp and --link-dir exclude each other")
 
 
 def _plans(line: list[str] | None, lines: int | None, devices: int) -> tuple[LinePlan, ...]:
@@ -76,19 +101,47 @@ def _plans(line: list[str] | None, lines: int | None, devices: int) -> tuple[Lin
     return tuple(LinePlan(f"line-{k + 1}", tuple(range(1, devices + 1))) for k in range(lines))
 
 
-async def _run(site: SimulatedSite, as_json: bool) -> None:
+def _stop() -> asyncio.Event:
+    """Set by SIGINT and SIGTERM."""
     stopped = asyncio.Event()
-    loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stopped.set)
-    site.open()
-    opened_at = loop.time()
+        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    return stopped
+
+
+async def _run_tcp(site: SimulatedSite, first: int, as_json: bool, *, closes: bool) -> None:
+    """The controllers of the site's lines behind servers; its ptys are never opened."""
+    stopped = _stop()
+    habits = Habits(closes=closes)
+    buses = [SimulatedServer(port.line.stations, habits=habits, bus=port.line.timing) for port in site.lines]
+    servers = [TcpServer(bus, port=first + number if first else 0) for number, bus in enumerate(buses)]
     try:
-        _announce(site, as_json)
+        for server in servers:
+            await server.open()
+        _announce(site, [server.url for server in servers], as_json)
+        await stopped.wait()
+    finally:
+        for server in servers:
+            server.close()
+    for plan, server in zip(site.plans, servers, strict=True):
+        seen = server.server.counters
+        print(
+            f"line={plan.name} connections={seen.connections} requests={seen.requests} replies={seen.replies}"
+            f" most_waiting={seen.most_waiting}",
+            file=sys.stderr,
+        )
+
+
+async def _run(site: SimulatedSite, as_json: bool) -> None:
+    stopped = _stop()
+    site.open()
+    opened_at = asyncio.get_running_loop().time()
+    try:
+        _announce(site, [line.path for line in site.lines], as_json)
         await stopped.wait()
     finally:
         site.close()
-    _sum_up(site, loop.time() - opened_at)
+    _sum_up(site, asyncio.get_running_loop().time() - opened_at)
 
 
 def _sum_up(site: SimulatedSite, elapsed_s: float) -> None:
@@ -103,8 +156,8 @@ def _sum_up(site: SimulatedSite, elapsed_s: float) -> None:
         )
 
 
-def _announce(site: SimulatedSite, as_json: bool) -> None:
-    """Tell the paths: a table for people, or one line of JSON for programs.
+def _announce(site: SimulatedSite, ports: Sequence[str], as_json: bool) -> None:
+    """Tell the ports: a table for people, or one line of JSON for programs.
 
     It is `{"lines": [{"name", "port", "addresses", "models"}]}`, addresses and models in the same order.
     """
@@ -112,27 +165,29 @@ def _announce(site: SimulatedSite, as_json: bool) -> None:
         listed = [
             {
                 "name": plan.name,
-                "port": line.path,
+                "port": port,
                 "addresses": list(plan.addresses),
                 "models": [unit.map.model for unit in _units(site, number)],
             }
-            for number, (plan, line) in enumerate(zip(site.plans, site.lines, strict=True))
+            for number, (plan, port) in enumerate(zip(site.plans, ports, strict=True))
         ]
         print(json.dumps({"lines": listed}), flush=True)
         return
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in ("line", "port", "addresses"):
         table.add_column(heading)
-    for plan, line in zip(site.plans, site.lines, strict=True):
+    for plan, port in zip(site.plans, ports, strict=True):
         units = (
             f"{address}:{plan.models[address]}" if address in plan.models else str(address)
             for address in plan.addresses
         )
-        table.add_row(plan.name, line.path, ", ".join(units))
+        table.add_row(plan.name, port, ", ".join(units))
     console = Console()
     console.print(table)
-    address, path = site.plans[0].addresses[0], site.lines[0].path
-    example = f"mbpoll -m rtu -b 9600 -P none -s 2 -a {address} -t 4:hex -0 -r 0 -c 82 -1 {path}"
+    address, at = site.plans[0].addresses[0], urlsplit(ports[0])
+    how = "-m rtu -b 9600 -P none -s 2" if at.port is None else f"-m tcp -p {at.port}"
+    where = at.path if at.port is None else at.hostname
+    example = f"mbpoll {how} -a {address} -t 4:hex -0 -r 0 -c 82 -1 {where}"
     console.print(f"Try: {example}", markup=False, soft_wrap=True, highlight=False)
     console.print("Ctrl-C ends it.")
 

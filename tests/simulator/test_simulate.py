@@ -13,6 +13,8 @@ import pytest
 from pymodbus.client import ModbusSerialClient
 
 from gateway.devices.model import DeviceMap
+from gateway.modbus.mbap import encode
+from gateway.modbus.pdu import ReadRequest
 from gateway.simulator.layout import DEMO_LAYOUT, Behaviour, LinePlan, SimulatedSite
 from gateway.simulator.oracle import OracleController
 
@@ -142,3 +144,38 @@ async def test_wrong_options_are_explained(arguments: list[str], said: str) -> N
     _, error = await program.communicate()
     assert program.returncode == 2
     assert said in " ".join(error.decode().replace("│", " ").split())
+
+
+@pytest.mark.parametrize("options", [(), ("--close-after-reply",)])
+async def test_it_serves_its_lines_by_modbus_tcp_where_wanted(options: tuple[str, ...]) -> None:
+    program = await asyncio.create_subprocess_exec(
+        *SIMULATE,
+        *("--tcp", "0", "--json", *options),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    assert program.stdout is not None
+    assert program.stderr is not None
+    try:
+        told = json.loads(await program.stdout.readline())["lines"]
+        assert [line["models"] for line in told] == [["prostar-mppt"] * 2, ["prostar-mppt", "tristar-mppt"]]
+        port = int(told[1]["port"].removeprefix("tcp://127.0.0.1:"))
+        for unit, size in ((1, 82), (2, 0x5C)):
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(encode(7, unit, ReadRequest(3, 0, size).encode()))
+            reply = await reader.readexactly(9 + 2 * size)
+            assert (reply[:2], reply[6], reply[7], reply[8]) == (b"\0\7", unit, 3, 2 * size)
+            if options:
+                assert await reader.read() == b"", "closed after the reply"
+            writer.close()
+    finally:
+        program.send_signal(signal.SIGTERM)
+    said = (await program.stderr.read()).decode()
+    assert await program.wait() == 0
+    assert "line=shelter-b connections=2 requests=2 replies=2" in said
+
+
+@pytest.mark.parametrize("options", [("--close-after-reply",), ("--tcp", "0", "--link-dir", ".")])
+async def test_options_that_do_not_go_together_are_refused(options: tuple[str, ...]) -> None:
+    program = await asyncio.create_subprocess_exec(*SIMULATE, *options, stderr=asyncio.subprocess.PIPE)
+    assert await program.wait() == 2
