@@ -85,7 +85,7 @@ async def cycles(folder: Path, count: int) -> None:
         first, last = sorted(took_s[:tenth]), sorted(took_s[-tenth:])
         assert last[len(last) // 2] < 3 * first[len(first) // 2] + 0.05
         assert line.line.stats.opens == 1 + WARM_UP + count
-        await line.online(limit_s=60.0)
+        await line.online(limit_s=150.0)  # one that a busy machine let seem silent is asked once a minute
         assert isinstance(await line.ask(0, read(0, 40)), bytes)
 
 
