@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Iterator
 
 from gateway.faces.snmp import wire
 from gateway.faces.snmp.objects import ClientRow, Gateway, ObjectType, Table
@@ -32,22 +33,21 @@ class ClientTail:
         column = self._columns.get(oid[depth]) if oid[:depth] == self.base and len(oid) == depth + 2 else None
         return None if column is None else self._varbind(column, oid[depth + 1], now)
 
-    def after(self, oid: Oid, now: float) -> tuple[Oid, bytes] | None:
-        """The first cell behind `oid`, or None at the end."""
+    def steps(self, oid: Oid, now: float) -> Iterator[tuple[bytes, bytes]]:
+        """Each cell behind `oid`: its encoded name and its varbind."""
         depth = len(self.base)
         if oid[:depth] > self.base:
-            return None
+            return
         arcs = oid[depth:] if oid[:depth] == self.base else ()
         rows = self._gateway.clients.present(now)
         for number in self._numbers:
             if arcs and number < arcs[0]:
                 continue
             at = bisect_right(rows, arcs[1]) if len(arcs) > 1 and number == arcs[0] else 0
-            if at < len(rows):
-                varbind = self._varbind(self._columns[number], rows[at], now)
-                assert varbind is not None, "somebody is in the row"
-                return (*self.base, number, rows[at]), varbind
-        return None
+            for row in rows[at:]:
+                varbind = self._varbind(self._columns[number], row, now)
+                if varbind is not None:
+                    yield wire.object_identifier((*self.base, number, row)), varbind
 
     def _varbind(self, column: ObjectType, row: int, now: float) -> bytes | None:
         cell = column.get(ClientRow(self._gateway, row), now)

@@ -13,8 +13,9 @@ from __future__ import annotations
 
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 from gateway.core.daylog import LoggedDay
 from gateway.devices.model import DeviceMap
@@ -107,30 +108,39 @@ class LogTail:
         if cells is None or not self._shows(column, unit):
             return None
         at = bisect_left(cells.hours, hour)
-        return self._varbind(oid, column, cells, at) if at < len(cells.hours) and cells.hours[at] == hour else None
+        if at == len(cells.hours) or cells.hours[at] != hour:
+            return None
+        content = wire.value(self._objects[column].syntax, _cell(cells, at))
+        return wire.varbind(wire.object_identifier(oid), content)
 
-    def after(self, oid: Oid, now: float) -> tuple[Oid, bytes] | None:
-        """The first cell behind `oid`, or None at the end."""
+    def steps(self, oid: Oid, now: float) -> Iterator[tuple[bytes, bytes]]:
+        """Each cell behind `oid`: its encoded name and its varbind."""
         del now
         keys = self._current()
+        by_unit = self._days.by_unit
+        start, place = self._behind(oid, keys)
+        for column, unit in islice(keys, start, None):
+            cells = by_unit[unit][column]
+            prefix = wire.object_identifier((*self.base, column, unit))[2:]
+            syntax = self._objects[column].syntax
+            for at in range(place, len(cells.hours)):
+                name = wire.tlv(0x06, prefix + wire.arcs((cells.hours[at],)))
+                yield name, wire.varbind(name, wire.value(syntax, _cell(cells, at)))
+            place = 0
+
+    def _behind(self, oid: Oid, keys: list[tuple[int, int]]) -> tuple[int, int]:
+        """Where a walk behind `oid` begins: position in `keys` and in the column of that key."""
         depth = len(self.base)
-        at = 0
         if oid[:depth] > self.base:
-            return None
-        if oid[:depth] == self.base:
-            arcs = oid[depth:]
-            key = (arcs[0] if arcs else 0, arcs[1] if len(arcs) > 1 else -1)
-            at = bisect_left(keys, key)
-            if len(arcs) > 2 and at < len(keys) and keys[at] == key:
-                cells = self._days.by_unit[key[1]][key[0]]
-                place = bisect_right(cells.hours, arcs[2])
-                if place < len(cells.hours):
-                    return self._cell(*key, cells, place)
-                at += 1
-        if at == len(keys):
-            return None
-        column, unit = keys[at]
-        return self._cell(column, unit, self._days.by_unit[unit][column], 0)
+            return len(keys), 0
+        arcs = oid[depth:] if oid[:depth] == self.base else ()
+        if not arcs:
+            return 0, 0
+        key = (arcs[0], arcs[1] if len(arcs) > 1 else -1)
+        at = bisect_left(keys, key)
+        if len(arcs) < 3 or at == len(keys) or keys[at] != key:
+            return at, 0
+        return at, bisect_right(self._days.by_unit[key[1]][key[0]].hours, arcs[2])
 
     def _current(self) -> list[tuple[int, int]]:
         days = self._days
@@ -156,17 +166,13 @@ class LogTail:
     def _cells(self, column: int, unit: int) -> Column | None:
         return self._days.by_unit.get(unit, {}).get(column)
 
-    def _cell(self, column: int, unit: int, cells: Column, place: int) -> tuple[Oid, bytes]:
-        oid = (*self.base, column, unit, cells.hours[place])
-        return oid, self._varbind(oid, column, cells, place)
 
-    def _varbind(self, oid: Oid, column: int, cells: Column, place: int) -> bytes:
-        number = cells.numbers[place]
-        value: int | bytes = number
-        if cells.octets:
-            # RFC 2578 §7.1.4: bit 0 is the most significant bit of the first octet.
-            value = int(f"{number:0{8 * cells.octets}b}"[::-1], 2).to_bytes(cells.octets, "big")
-        return wire.varbind(wire.object_identifier(oid), wire.value(self._objects[column].syntax, value))
+def _cell(cells: Column, place: int) -> int | bytes:
+    number = cells.numbers[place]
+    if not cells.octets:
+        return number
+    # RFC 2578 §7.1.4: bit 0 is the most significant bit of the first octet.
+    return int(f"{number:0{8 * cells.octets}b}"[::-1], 2).to_bytes(cells.octets, "big")
 
 
 def _seconds(value: float | None) -> int | None:

@@ -6,6 +6,8 @@ result depends on.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from gateway.core.site import Device
 from gateway.faces.snmp import reader, wire
 from gateway.faces.snmp.columns import Column
@@ -52,7 +54,7 @@ class Reading:
         found = self._window.from_place(start, self._now)
         if found is None:
             self.spans.append((start, self._window.size))
-            step = self._in_tail(name)
+            step = next(self._steps(name), None)
             return (step[1], True) if step is not None else (wire.varbind(name, wire.END_OF_MIB_VIEW), False)
         self.spans.append((start, found[0] + 1))
         return found[1], True
@@ -103,12 +105,12 @@ class Reading:
                 place += many
         return list(watched)
 
-    def _in_tail(self, name: bytes) -> tuple[bytes, bytes] | None:
-        """The name and varbind of the first cell of the tails behind a name, or None at the end."""
+    def _steps(self, name: bytes) -> Iterator[tuple[bytes, bytes]]:
+        """Name and varbind of each cell of the tails behind a name."""
         tails = self._window.tails
-        self._lasts = self._lasts and not tails.tails
-        found = tails.after(reader.oid(name), self._now)
-        return None if found is None else (wire.object_identifier(found[0]), found[1])
+        if tails.tails:
+            self._lasts = False
+            yield from tails.steps(reader.oid(name), self._now)
 
     def _behind(self, name: bytes) -> int:
         """The first place behind a name."""
@@ -145,8 +147,9 @@ class Reading:
 
     def _rest(self, name: bytes, repetitions: int, left: int, out: list[bytes]) -> None:
         """`repetitions` steps behind a name that has only the tails behind it."""
+        steps = self._steps(name)
         for _ in range(repetitions):
-            step = self._in_tail(name)
+            step = next(steps, None)
             varbind = wire.varbind(name, wire.END_OF_MIB_VIEW) if step is None else step[1]
             left -= len(varbind)
             if left < 0:
@@ -165,7 +168,7 @@ class Reading:
             for position, place in enumerate(places):
                 found = from_place(place, now)
                 if found is None:
-                    step = self._in_tail(names[position])
+                    step = next(self._steps(names[position]), None)
                     varbind = wire.varbind(names[position], wire.END_OF_MIB_VIEW) if step is None else step[1]
                     places[position] = window.size
                     if step is not None:

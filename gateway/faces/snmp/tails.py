@@ -6,7 +6,7 @@ the snapshot of a device.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Protocol
 
 from gateway.faces.snmp.settings import Oid, View
@@ -24,8 +24,8 @@ class Tail(Protocol):
         """The varbind of exactly this OID, or None."""
         ...
 
-    def after(self, oid: Oid, now: float) -> tuple[Oid, bytes] | None:
-        """The first cell behind `oid`, or None at the end."""
+    def steps(self, oid: Oid, now: float) -> Iterator[tuple[bytes, bytes]]:
+        """Each cell behind `oid`: its encoded name and its varbind."""
         ...
 
     def through(self, view: View) -> Tail:
@@ -49,13 +49,10 @@ class Tails:
                 return tail.get(oid, now)
         return None
 
-    def after(self, oid: Oid, now: float) -> tuple[Oid, bytes] | None:
+    def steps(self, oid: Oid, now: float) -> Iterator[tuple[bytes, bytes]]:
         """See Tail."""
         for tail in self.tails:
-            found = tail.after(oid, now)
-            if found is not None:
-                return found
-        return None
+            yield from tail.steps(oid, now)
 
     def through(self, view: View) -> Tails:
         """See Tail."""

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import accumulate
 
 from gateway.core.site import Device
+from gateway.faces.snmp import reader
 from gateway.faces.snmp.client_tail import ClientTail
 from gateway.faces.snmp.columns import Cell, Column, Rows, column_of
 from gateway.faces.snmp.entity import entities
@@ -106,7 +107,8 @@ class Window:
         """The first instantiated cell behind `oid` in lexicographic order, or None at the end."""
         found = self.from_place(self.place_after(oid), now)
         if found is None:
-            return self.tails.after(oid, now)
+            step = next(self.tails.steps(oid, now), None)
+            return None if step is None else (reader.oid(step[0]), step[1])
         number, at = self.locate(found[0])
         column = self.columns[number]
         return (*column.base, *column.rows.indexes[at]), found[1]

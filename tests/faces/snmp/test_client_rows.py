@@ -11,6 +11,7 @@ from gateway.faces.snmp.client_tail import ClientTail
 from gateway.faces.snmp.counters import SnmpCounters
 from gateway.faces.snmp.layout import shipped_layout
 from gateway.faces.snmp.objects import Gateway
+from gateway.faces.snmp.reader import oid
 from gateway.faces.snmp.settings import EVERYTHING, Oid, View
 
 
@@ -85,13 +86,8 @@ TABLE = next(table for table in shipped_layout().tables if table.name == "pgwCli
 BASE: Oid = (*TABLE.base, 1)
 
 
-def walk(tail: ClientTail, now: float) -> list[Oid]:
-    found: list[Oid] = []
-    at: Oid = ()
-    while (step := tail.after(at, now)) is not None:
-        at = step[0]
-        found.append(at)
-    return found
+def walk(tail: ClientTail, now: float, start: Oid = ()) -> list[Oid]:
+    return [oid(name) for name, _ in tail.steps(start, now)]
 
 
 def tail_of(face: Face) -> ClientTail:
@@ -108,11 +104,12 @@ def test_only_rows_that_somebody_is_in_have_cells() -> None:
     face.comes("192.0.2.8")
     found = walk(tail, face.now)
     assert found == [(*BASE, column, row) for column in range(2, 11) for row in (1, 2)]
-    assert all(tail.get(oid, face.now) is not None for oid in found)
+    assert all(tail.get(each, face.now) is not None for each in found)
     assert tail.get((*BASE, 2, 3), face.now) is None
     assert tail.get((*BASE, 2), face.now) is None
-    assert tail.after((*BASE, 2, 1, 5), face.now) == tail.after((*BASE, 2, 1), face.now)
-    assert tail.after((*TABLE.base, 2), face.now) is None
+    for number, start in enumerate(found, 1):
+        assert walk(tail, face.now, start) == walk(tail, face.now, (*start, 5)) == found[number:]
+    assert walk(tail, face.now, (*TABLE.base, 2)) == []
 
 
 def test_a_view_shows_columns_or_nothing() -> None:
@@ -121,6 +118,6 @@ def test_a_view_shows_columns_or_nothing() -> None:
     tail = tail_of(face)
     assert tail.through(EVERYTHING) is tail
     some = tail.through(View((BASE,), ((*BASE, 2), (*BASE, 3, 1))))
-    assert {oid[-2] for oid in walk(some, face.now)} == set(range(4, 11))
+    assert {each[-2] for each in walk(some, face.now)} == set(range(4, 11))
     assert some.get((*BASE, 2, 1), face.now) is None
     assert walk(tail.through(View()), face.now) == []

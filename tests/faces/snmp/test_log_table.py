@@ -7,6 +7,7 @@ import time
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import islice
 
 import pytest
 from hypothesis import given
@@ -24,6 +25,7 @@ from gateway.faces.snmp.layout import layout, shipped_layout
 from gateway.faces.snmp.log_keeper import LogKeeper
 from gateway.faces.snmp.log_table import MOST_DAYS, LogDays, LogTail, days_of
 from gateway.faces.snmp.objects import Syntax
+from gateway.faces.snmp.reader import oid
 from gateway.faces.snmp.settings import EVERYTHING, Oid, View
 from gateway.faces.snmp.wire import object_identifier, value, varbind
 from tests.faces.snmp.stub_site import Ask
@@ -59,12 +61,20 @@ def tail_of(*logs: tuple[int, list[LoggedDay]], view: View | None = None) -> Log
     return LogTail(TABLE, days, view)
 
 
+def after(tail: LogTail, start: Oid) -> tuple[Oid, bytes] | None:
+    step = next(tail.steps(start, 0.0), None)
+    return None if step is None else (oid(step[0]), step[1])
+
+
 def walk(tail: LogTail) -> list[Oid]:
-    found: list[Oid] = []
+    found = [oid(name) for name, _ in tail.steps((), 0.0)]
     at: Oid = ()
-    while (step := tail.after(at, 0.0)) is not None:
+    for each in found:
+        step = after(tail, at)
+        assert step is not None
         at = step[0]
-        found.append(at)
+        assert at == each
+    assert after(tail, at) is None
     return found
 
 
@@ -91,8 +101,11 @@ def test_it_is_the_last_table() -> None:
 )
 def test_cells(name: str, syntax: Syntax, expected: int | bytes) -> None:
     tail = tail_of((11, [day(2400)]))
-    oid = cell(name, 2400)
-    assert tail.get(oid, 0.0) == varbind(object_identifier(oid), value(syntax, expected))
+    at = cell(name, 2400)
+    expected_varbind = varbind(object_identifier(at), value(syntax, expected))
+    assert tail.get(at, 0.0) == expected_varbind
+    step = after(tail, cell(name, 2399))
+    assert step == (at, expected_varbind)
 
 
 def test_every_field_of_a_log_has_its_column() -> None:
@@ -105,9 +118,9 @@ def test_every_field_of_a_log_has_its_column() -> None:
 def test_a_value_that_is_none_has_no_cell() -> None:
     few: dict[str, Value] = {"charge": 1e9, "battery_voltage_minimum": float("nan"), "absorption_time": -1}
     tail = tail_of((11, [day(24, few, written_at=None), day(48)]))
-    assert [oid for oid in walk(tail) if oid[-1] == 24] == []
+    assert [each for each in walk(tail) if each[-1] == 24] == []
     assert tail.get(cell("pgwLogCharge", 24), 0.0) is None
-    step = tail.after(cell("pgwLogCharge", 0), 0.0)
+    step = after(tail, cell("pgwLogCharge", 0))
     assert step is not None
     assert step[0] == cell("pgwLogCharge", 48)
 
@@ -118,7 +131,7 @@ def test_a_walk_goes_by_column_device_and_hourmeter() -> None:
     assert found == sorted(found)
     assert len(found) == 3 * (2 + 11)
     assert found[:3] == [(*BASE, 2, 11, 24), (*BASE, 2, 11, 48), (*BASE, 2, 21, 5)]
-    assert all(tail.get(oid, 0.0) is not None for oid in found)
+    assert all(tail.get(each, 0.0) is not None for each in found)
 
 
 @given(st.lists(st.integers(0, 6), max_size=6))
@@ -127,7 +140,7 @@ def test_a_step_is_to_the_next_cell_wherever_it_begins(arcs: list[int]) -> None:
     found = walk(tail)
     for start in ((*BASE, *arcs), (*TABLE.base, *arcs), tuple(arcs)):
         at = bisect_right(found, start)
-        step = tail.after(start, 0.0)
+        step = after(tail, start)
         assert (None if step is None else step[0]) == (found[at] if at < len(found) else None)
 
 
@@ -140,9 +153,9 @@ def test_new_days_take_the_place_of_the_old() -> None:
     days = LogDays()
     tail = LogTail(TABLE, days)
     days.put(11, days_of(MAP, [day(24)]))
-    assert {oid[-1] for oid in walk(tail)} == {24}
+    assert {each[-1] for each in walk(tail)} == {24}
     days.put(11, days_of(MAP, [day(48), day(72)]))
-    assert {oid[-1] for oid in walk(tail)} == {48, 72}
+    assert {each[-1] for each in walk(tail)} == {48, 72}
     days.put(11, {})
     assert walk(tail) == []
 
@@ -162,10 +175,10 @@ def test_new_days_take_the_place_of_the_old() -> None:
 def test_a_view_shows_columns_of_devices_or_nothing(view: View, shown: set[int]) -> None:
     tail = tail_of((11, [day(24)]), (21, [day(24)])).through(view)
     found = walk(tail)
-    assert {oid[-2] for oid in found} == shown
-    assert all(view.shows(oid) and tail.get(oid, 0.0) is not None for oid in found)
+    assert {each[-2] for each in found} == shown
+    assert all(view.shows(each) and tail.get(each, 0.0) is not None for each in found)
     hidden = set(walk(tail_of((11, [day(24)]), (21, [day(24)])))) - set(found)
-    assert all(tail.get(oid, 0.0) is None for oid in hidden)
+    assert all(tail.get(each, 0.0) is None for each in hidden)
 
 
 def test_a_reply_full_of_cells_of_200_full_logs_is_short_work() -> None:
@@ -183,16 +196,14 @@ def test_a_reply_full_of_cells_of_200_full_logs_is_short_work() -> None:
         for _ in range(100):
             days.put(1, log)  # new days of a device, so that the order is made anew
             before = time.thread_time()  # not what other programs take
-            for _ in range(50):
-                step = tail.after(at, 0.0)
-                assert step is not None
-                at = step[0]
+            steps = list(islice(tail.steps(at, 0.0), 50))
             worst = max(worst, time.thread_time() - before)
+            at = oid(steps[-1][0])
             at = (*at[:-2], at[-2] + 2, 0) if at[-2] < 199 else (*BASE, at[-3] + 1)
     finally:
         gc.enable()
     assert worst < 0.005
-    assert tail.after((*BASE, 14, 200, 24 * MOST_DAYS), 0.0) is None
+    assert after(tail, (*BASE, 14, 200, 24 * MOST_DAYS)) is None
 
 
 class Source:
@@ -220,14 +231,14 @@ async def test_a_device_is_read_when_its_log_was_harvested(site: Site) -> None:
     await keeper.look()
     await keeper.look()
     assert source.asked == ["shelter-a array-1"]
-    assert {oid[-2:] for oid in walk(LogTail(TABLE, keeper.days))} == {(11, 24)}
+    assert {each[-2:] for each in walk(LogTail(TABLE, keeper.days))} == {(11, 24)}
     stats.devices[11].days, stats.devices[11].harvested_at = 2, 9.0
     source.broken = True
     await keeper.look()
     source.broken = False
     source.days["array-1"].append(day(48))
     await keeper.look()
-    assert {oid[-2:] for oid in walk(LogTail(TABLE, keeper.days))} == {(11, 24), (11, 48)}
+    assert {each[-2:] for each in walk(LogTail(TABLE, keeper.days))} == {(11, 24), (11, 48)}
 
 
 def test_models_that_disagree_about_a_column_are_refused(device_map: DeviceMap) -> None:
@@ -259,13 +270,13 @@ async def test_snmptable_shows_it(ask: Ask) -> None:
 async def test_a_day_that_comes_later_is_found(ask: Ask, agent: SnmpAgent) -> None:
     tail = agent.tree.tails.tails[-1]
     assert isinstance(tail, LogTail)
-    oid = "PROSTAR-GATEWAY-MIB::pgwLogCharge.21.48"
+    name = "PROSTAR-GATEWAY-MIB::pgwLogCharge.21.48"
     for _ in range(2):
-        _, output = await ask("snmpget", oid)
+        _, output = await ask("snmpget", name)
         assert "No Such Instance" in output
     tail._days.put(21, days_of(MAP, [day(24), day(48)]))
-    _, output = await ask("snmpget", oid)
-    assert output == f"{oid} = INTEGER: 12250 milliampere-hours\n"
+    _, output = await ask("snmpget", name)
+    assert output == f"{name} = INTEGER: 12250 milliampere-hours\n"
 
 
 @pytest.mark.peer
