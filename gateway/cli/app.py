@@ -10,7 +10,7 @@ import typer
 from gateway.cli import backup, check_config, clients, demo, generate, log, record, run, scan, simulate, writes
 
 app = typer.Typer(
-    help="Modbus TCP, SNMP and Prometheus for Morningstar ProStar MPPT controllers on serial lines.",
+    help="Modbus TCP, SNMP and Prometheus for Morningstar solar charge controllers on serial lines.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,  # an operator's log wants the plain traceback

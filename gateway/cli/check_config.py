@@ -29,7 +29,8 @@ def command(config: ConfigOption) -> None:
     console = Console()
     console.print(_lines(checked, budgets), _devices(checked, budgets), sep="\n")
     modbus = f"Modbus TCP {_at(checked.modbus.listen)}{_tls(checked)}"
-    console.print(f"Faces  {modbus} · SNMP {_snmp(checked)} · HTTP {_at(checked.http.listen)}")
+    for name, face in (("Faces", modbus), ("", f"SNMP {_snmp(checked)}"), ("", f"HTTP {_at(checked.http.listen)}")):
+        console.print(f"{name:6} {face}", soft_wrap=True)
     if snmp_on(checked) and checked.snmp.emc1:
         console.print(f"EMC-1  {_emc1(checked)}")
     console.print(f"Writes {_writes(checked)}")

@@ -91,10 +91,11 @@ def _credentials(http: HttpTable) -> dict[str, str]:
 
 
 def _table(clients: Sequence[Mapping[str, Any]]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("client", overflow="fold")
-    for heading in ("open", "last seen", "requests", "from memory", "line", "limited", "exceptions"):
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    table.add_column("client", overflow="fold", min_width=len("255.255.255.255"))
+    for heading in ("open", "last\nseen", "requests", "from\nmemory", "line", "limited"):
         table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("exceptions", justify="right", overflow="fold", min_width=len("01:1,000"))
     for client in clients:
         requests = client["requests"]
         share = f"{client['cache_hits'] / requests:.1%}" if requests else ""

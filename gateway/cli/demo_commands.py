@@ -34,7 +34,7 @@ def commands_to_try(modbus_port: int, snmp_port: int, http_port: int, folder: Pa
         Try(
             "battery, array and load registers of unit 11, as float16", f"{mbpoll} -a 11 -t 4:hex -r 16 -c 8 127.0.0.1"
         ),
-        Try("charge state of all three", f"{mbpoll} -a 11:13 -t 4 -r 33 -c 1 127.0.0.1"),
+        Try("charge state of the three ProStars", f"{mbpoll} -a 11:13 -t 4 -r 33 -c 1 127.0.0.1"),
         *walks,
         Try("battery voltages as Prometheus sees them", f"curl -s {http}/metrics | grep battery_voltage_volts"),
         Try("whether the gateway is ready", f"curl -s {http}/readyz"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import asdict
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -46,18 +46,18 @@ def command(
 
 
 def _table(found: list[Entry]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for heading in ("when", "who"):
-        table.add_column(heading, overflow="fold")
-    table.add_column("unit", justify="right")
-    for heading in ("point", "address"):
-        table.add_column(heading, overflow="fold")
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    table.add_column("when", min_width=len("2026-11-22"))
+    table.add_column("who", overflow="fold")
+    table.add_column("unit", justify="right", no_wrap=True)
+    table.add_column("point", overflow="fold", min_width=len("float_voltage"))
+    table.add_column("address", no_wrap=True)
     for heading in ("old", "new"):
         table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("outcome", overflow="fold")
+    table.add_column("outcome", overflow="fold", min_width=len("not written"))
     for entry in found:
         intent = entry.intent
-        when = datetime.fromtimestamp(intent.at).astimezone().isoformat(sep=" ", timespec="seconds")
+        when = f"{datetime.fromtimestamp(intent.at, UTC):%Y-%m-%d %H:%M:%SZ}"  # as the log has it
         who = intent.peer if intent.role is None else f"{intent.peer} ({intent.role})"
         address = f"0x{intent.address:04X}" + (" coil" if intent.space is Space.COILS else "")
         row = (when, who, str(intent.unit_id), intent.point, address, _word(intent.old), _word(intent.new))

@@ -19,6 +19,9 @@ from gateway.service.schema import Config, WriteTable, parse_range
 
 Raw = Mapping[str, object]
 
+SHOWN = 3
+"""So many settings are named in a piece of advice."""
+
 
 def write_rules(config: Config) -> tuple[WriteRule, ...]:
     """The rules of the file; none where writes are off."""
@@ -84,6 +87,7 @@ def write_advice(config: Config) -> Iterator[str]:
                 yield f"{path}.source[{number}]: {network} is everybody"
             elif not network.is_loopback and network.num_addresses > 1:
                 yield f"{path}.source[{number}]: each of {network.num_addresses} addresses ({network}) may write"
+        yield from _wear_advice(path, table, maps)
         left_out = dict.fromkeys(
             point.name
             for device_map in maps
@@ -92,6 +96,22 @@ def write_advice(config: Config) -> Iterator[str]:
         )
         if left_out:
             yield f"{path}: to be written, these must be named in point, whatever the ranges: {', '.join(left_out)}"
+
+
+def _wear_advice(path: str, table: WriteTable, maps: Sequence[DeviceMap]) -> Iterator[str]:
+    wearing = list(dict.fromkeys(point.name for each in maps for point in each.points if _wears(table, each, point)))
+    if wearing:
+        some = ", ".join(wearing[:SHOWN]) + (f" and {len(wearing) - SHOWN} more" if len(wearing) > SHOWN else "")
+        yield (
+            f"{path}: a write to {some} goes to the controller's EEPROM and can raise its setting-changed fault, "
+            "which may keep charging and the load off until the controller is reset"
+        )
+
+
+def _wears(table: WriteTable, device_map: DeviceMap, point: Point) -> bool:
+    """Whether the rule lets this setting, kept in EEPROM, be changed."""
+    named = point.name in table.point or (not point.named_only and _covered(table, point))
+    return named and point.access is Access.WRITE and device_map.wears(point)
 
 
 def _maps(models_of: Iterable[str]) -> list[DeviceMap]:

@@ -108,6 +108,15 @@ def test_nobody_so_far_then_who_asked(running: Running) -> None:
     assert row[-5:] == ["3", "0.0%", "0", "0", "0A:3"]
 
 
+def test_a_narrow_terminal_shows_who_it_is(running: Running) -> None:
+    ask(running.modbus, 2)
+    done = CliRunner(env={"COLUMNS": "80"}).invoke(app, ["clients", "-c", str(running.config)])
+    assert done.stdout.splitlines()[2].split() == [
+        *("client", "open", "seen", "requests", "memory", "line", "limited", "exceptions")
+    ]
+    assert "\n 127.0.0.7 " in done.stdout
+
+
 def test_json_is_what_the_gateway_says(running: Running) -> None:
     ask(running.modbus, 2)
     status, shown, _ = run("-c", str(running.config), "--json")

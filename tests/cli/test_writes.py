@@ -84,6 +84,13 @@ def test_how_each_write_ended(config: Path, records: tuple[Record, ...], expecte
     assert row.split()[2:8] == ["192.0.2.7", "11", "float_voltage", "0xE001", "0x4AE6", "0x4B00"]
 
 
+def test_a_narrow_terminal_breaks_no_word(config: Path) -> None:
+    note(config, intent("a", point="float_voltage"), Verdict("a", NOW, Fate.WRITTEN, found=0x4B00))
+    done = CliRunner(env={"COLUMNS": "80"}).invoke(app, ["writes", "-c", str(config)])
+    for word in ("2027-01-15", "08:00:00Z", "192.0.2.7", "float_voltage", "0x4B00", "written"):
+        assert word in done.output
+
+
 def test_coils_roles_and_what_is_not_known(config: Path) -> None:
     note(config, intent("a", space=Space.COILS, address=0xFF, old=None, new=1, role="[b]operator[/b]"))
     text = run(config)

@@ -81,4 +81,24 @@ ALLOW = 'allow = ["0.0.0.0/0"]\n'
 )
 def test_advice_about_writing(text: str, expected: str) -> None:
     config = parse_config(SITE + text)
-    assert [line for line in advice(config, line_budgets(config)) if line.startswith("modbus.write")] == [expected]
+    given = [line for line in advice(config, line_budgets(config)) if line.startswith("modbus.write")]
+    assert [line for line in given if "EEPROM" not in line] == [expected]
+
+
+@pytest.mark.parametrize(
+    ("rule", "named"),
+    [
+        ('point = ["absorption_time", "equalize_triggered"]', "absorption_time"),
+        ('registers = ["0xE000-0xE002"]', "absorption_voltage, float_voltage, absorption_time"),
+        ('registers = ["0xE000-0xE005"]', "absorption_voltage, float_voltage, absorption_time and 3 more"),
+        ('point = ["reset_control"]\nregisters = ["0x0025"]\ncoils = ["0x0000-0x0002"]', ""),
+    ],
+)
+def test_it_says_what_a_change_of_a_setting_does_to_the_controller(rule: str, named: str) -> None:
+    config = parse_config(SITE + ON + RULE + rule + "\n")
+    expected = (
+        f"modbus.write[0]: a write to {named} goes to the controller's EEPROM and can raise its setting-changed fault, "
+        "which may keep charging and the load off until the controller is reset"
+    )
+    given = [line for line in advice(config, line_budgets(config)) if "EEPROM" in line]
+    assert given == ([expected] if named else [])
