@@ -25,6 +25,7 @@ def advised(text: str) -> tuple[str, ...]:
 
 def test_a_file_that_is_as_it_should_be_needs_none() -> None:
     assert advised(CLEAN) == ()
+    assert advised(CLEAN.replace('"/dev/serial/by-id/usb-a"', '"tcp://192.0.2.8:502"\nreply_timeout_s = 3.0')) == ()
     for name in ("by-id/usb-FTDI_FT232R_USB_UART_A50285BI-if00-port0", "by-path/pci-0000:00:14.0-usb-0:2:1.0-port0"):
         assert advised(CLEAN.replace("by-id/usb-a", name)) == ()
 
@@ -36,6 +37,10 @@ def test_a_file_that_is_as_it_should_be_needs_none() -> None:
         (
             HEAD + LINE,
             "snmp.community, snmp.user: there is none, so nobody can read by SNMP and the port is not opened",
+        ),
+        (
+            CLEAN.replace("/dev/serial/by-id/usb-a", "tcp://192.0.2.8:502"),
+            "line[0].reply_timeout_s: 0.5 s has to do for the network",
         ),
         (CLEAN.replace("/dev/serial/by-id/usb-a", "/dev/ttyUSB0"), "line[0].port: /dev/ttyUSB0 may be another adapter"),
         (CLEAN.replace("/dev/serial/by-id/usb-a", "/dev/ttyACM0"), "line[0].port: /dev/ttyACM0 may be another adapter"),
