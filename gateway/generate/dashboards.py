@@ -91,6 +91,7 @@ def _site() -> list[Row]:
             [Query(f"morningstar_battery_current_net_amperes{_AT_SITE}", by_device)],
             unit="amp",
         ),
+        Panel("Charge current", [Query(f"morningstar_charge_current_amperes{_AT_SITE}", by_device)], unit="amp"),
         Panel(
             "Load power",
             [

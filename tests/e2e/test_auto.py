@@ -99,6 +99,30 @@ def test_a_reload_keeps_what_was_found(site: Running) -> None:
     assert len(re.findall("event=model_found", site.gateway.log())) == 4
 
 
+def test_what_was_found_can_be_written_where_a_rule_allows_it(launch: Launch, start: Start, tmp_path: Path) -> None:
+    start(sys.executable, "-m", "tests.e2e.fast_lines", str(tmp_path), "plants", "stranger")
+    wait_until((tmp_path / "shelter-b").exists, "the fast lines")
+    rule = '[[modbus.write]]\nsource = ["127.0.0.1/32"]\npoint = ["absorption_voltage"]\n'
+    keys, line = "writes = true\nwrite_interval_s = 0.0", f"baudrate = {BAUDRATE}"
+    site = launch(simulate=None, devices=DEVICES, line_keys=line, rest=rule, modbus_keys=keys, models=AUTO)
+    wait_until(lambda: len(models(site)) == 4, "the models in /metrics")
+    settings = r'morningstar_absorption_voltage_volts\{device="array-4",.*\} ([\d.]+)'
+    wait_until(lambda: re.search(settings, site.get("/metrics")[1]), "the settings of the TriStar")
+    with ModbusTcpClient("127.0.0.1", port=site.modbus, timeout=10, retries=0) as client:
+        scaling = client.read_holding_registers(0x0000, count=2, device_id=14).registers
+        word = round(56.0 * 32768 / (scaling[0] + scaling[1] / 65536))
+        assert not client.write_register(0xE000, word, device_id=14).isError()
+        assert client.read_holding_registers(0xE000, count=1, device_id=14).registers == [word]
+        assert client.write_register(0xE001, word, device_id=14).exception_code == 1, "no rule names it"
+        assert client.write_register(0xE000, word, device_id=15).exception_code == 1, "nothing is written to a stranger"
+
+    def shown() -> bool:
+        found = re.search(settings, site.get("/metrics")[1])
+        return found is not None and abs(float(found[1]) - 56.0) < 0.01
+
+    wait_until(shown, "the new setting in /metrics")
+
+
 def test_check_config_accepts_it_and_says_what_it_means(tmp_path: Path) -> None:
     write_config(tmp_path / "site.toml", (1502, 1161, 9850), DEVICES, models=AUTO)
     command = [*GATEWAY, "check-config", "-c", str(tmp_path / "site.toml")]
