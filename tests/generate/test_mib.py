@@ -130,6 +130,32 @@ def test_net_snmp_loads_the_repositorys_folder_as_the_readme_says(peer: Callable
     assert (found.stderr, found.stdout) == ("", ".1.3.6.1.4.1.32473.1.1.2.1.1.1.0\n")
 
 
+@pytest.mark.peer
+@pytest.mark.parametrize("base", base_folders())
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [
+        ("sysName.0", "1.3.6.1.2.1.1.5.0"),
+        ("sysORDescr.2", "1.3.6.1.2.1.1.9.1.3.2"),
+        ("snmpInASNParseErrs.0", "1.3.6.1.2.1.11.6.0"),
+        ("snmpTrapOID.0", "1.3.6.1.6.3.1.1.4.1.0"),
+        ("coldStart", "1.3.6.1.6.3.1.1.5.1"),
+        ("authenticationFailure", "1.3.6.1.6.3.1.1.5.5"),
+    ],
+)
+def test_what_every_agent_serves_and_sends_has_its_name(
+    peer: Callable[[str], str], base: str, name: str, number: str
+) -> None:
+    found = subprocess.run(
+        [peer("snmptranslate"), "-M", base, "-m", "SNMPv2-MIB", "-On", f"SNMPv2-MIB::{name}"],
+        env={**os.environ, "SNMPCONFPATH": "/nonexistent"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert (found.stderr, found.stdout) == ("", f".{number}\n")
+
+
 def test_pysmi_compiles_it(folder: Path) -> None:
     compiled: dict[str, str] = {}
     compiler = MibCompiler(

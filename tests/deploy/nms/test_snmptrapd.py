@@ -60,7 +60,7 @@ async def test_it_writes_a_line_and_calls_the_handler(
     config = tmp_path / "snmptrapd.conf"
     config.write_text(configured(delivered("snmptrapd.conf"), gateway.agent.engine().engine_id, handler))
     process = await asyncio.create_subprocess_exec(
-        *(peer("snmptrapd"), "-f", "-Lo", "-C", "-c", str(config), "-m", "PROSTAR-GATEWAY-MIB"),
+        *(peer("snmptrapd"), "-f", "-Lo", "-C", "-c", str(config), "-m", "ALL"),
         *("-M", f"{tmp_path}:{REPOSITORY / 'mibs' / 'base'}", f"udp:127.0.0.1:{port}"),
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,
