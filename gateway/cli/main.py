@@ -18,8 +18,10 @@ def main() -> None:
     """Run the command line."""
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _leave)
-    from gateway.cli.app import app  # noqa: PLC0415 - only now are signals handled
-
+    if sys.argv[1:2] == ["run"]:
+        from gateway.cli.run_app import app  # noqa: PLC0415 - only now are signals handled
+    else:
+        from gateway.cli.app import app  # noqa: PLC0415 - as above
     app(prog_name="prostar-gateway")
 
 
