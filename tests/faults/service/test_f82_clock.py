@@ -101,7 +101,7 @@ async def test_nobody_notices(
             shown_s = await asyncio.to_thread(uptime_s, snmpget, service, noc)
             assert abs(shown_s - up_s - (loop.time() - began)) < 2.0
     assert reader.replies == {b"\x03\x04"}
-    assert reader.worst_s < 3.0
+    assert reader.worst_s < 5.0
     # No burst of polls that were missed in the time that never was, and no pause until a time that is long over.
     assert 0.5 < (len(unit.asked) - asked) / (loop.time() - stepping) / polls_per_s < 2.0
     log = program.log()
