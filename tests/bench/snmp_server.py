@@ -18,6 +18,7 @@ from dataclasses import replace
 from ipaddress import ip_network
 
 from gateway.clock import SystemClock
+from gateway.core.conditions import Conditions
 from gateway.core.site import Device, Site
 from gateway.core.snapshot import Block, DeviceState, Snapshot
 from gateway.core.stats import ModbusServerStats
@@ -29,6 +30,7 @@ from gateway.faces.snmp.agent import SnmpAgent
 from gateway.faces.snmp.secret import Secret
 from gateway.faces.snmp.settings import Community, SnmpSettings, User
 from gateway.faces.snmp.usm import Auth, Credentials, Priv
+from gateway.service.garbage import set_aside
 from tests.bench.gateway_server import NoLine
 
 UNITS = 200
@@ -85,7 +87,8 @@ async def serve(port: int, modbus_port: int) -> None:
         users=(User(BENCH, LOOPBACK),),
         requests_per_s=1e9,
     )
-    agent = SnmpAgent(settings, site, clock, stats)
+    conditions = Conditions(site, (), clock.monotonic())
+    agent = SnmpAgent(settings, site, clock, stats, conditions=conditions)
     turns = Turns(agent)
     agent.answer_waiting = turns.answer_waiting  # type: ignore[method-assign]
     asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, turns.tell)
@@ -95,8 +98,10 @@ async def serve(port: int, modbus_port: int) -> None:
     decoded = [values(device_map, at) for at in range(DECODED)]  # what decoding costs is not the face's
     await modbus.listeners[0].start()
     await agent.listeners[0].start()
+    set_aside()  # as the gateway does once it has started
     while True:
         number += 1
+        conditions.look(clock.monotonic())  # as its keeper does
         for device in devices:
             now = clock.monotonic()
             block = Block(Space.REGISTERS, 0, 0x52, data, now)

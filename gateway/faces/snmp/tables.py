@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 from gateway.core.site import LineState
 from gateway.core.snapshot import DeviceState
-from gateway.devices.model import Group
+from gateway.devices.model import DeviceMap, Group
 from gateway.faces.snmp.objects import (
     CellValue,
     Changes,
@@ -306,13 +306,21 @@ def _since_reply(row: DeviceRow, now: float) -> int | None:
     return _ticks_since(row.device.snapshot.last_reply_at, now)
 
 
+_names_of: dict[tuple[int, Group], tuple[DeviceMap, tuple[str, ...]]] = {}
+
+
+def _names(device_map: DeviceMap, group: Group) -> tuple[str, ...]:
+    """The points of a group; found once a map, since a walk asks for the age of every device."""
+    key = (id(device_map), group)
+    known = _names_of.get(key)
+    if known is None or known[0] is not device_map:
+        known = _names_of[key] = device_map, tuple(point.name for point in device_map.points if point.group is group)
+    return known[1]
+
+
 def _oldest(row: DeviceRow, now: float, group: Group) -> int | None:
-    snapshot = row.device.snapshot
-    times = [
-        snapshot.read_at[point.name]
-        for point in row.device.map.points
-        if point.group is group and point.name in snapshot.read_at
-    ]
+    read_at = row.device.snapshot.read_at
+    times = [read_at[name] for name in _names(row.device.map, group) if name in read_at]
     return _ticks_since(min(times), now) if times else None
 
 
