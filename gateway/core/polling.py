@@ -197,7 +197,7 @@ class Polling:
                 record.known = record.known.learned(record.seen())
             return DeviceState.ONLINE
         asking = any(item.block is None and item not in live for item in record.polls.items)
-        if not complete or asking or not self._verify(record):
+        if asking or (not complete and not self._stranger(record)) or not self._verify(record):
             return record.state
         return DeviceState.ONLINE
 
@@ -216,6 +216,10 @@ class Polling:
             return None
         points = {name: record.device.map.point(name) for name in record.rewrites}
         return min(at + REWRITE_WARNING_SHARE * (points[name].rewrite_s or 0.0) for name, at in record.rewrites.items())
+
+    def _stranger(self, record: DeviceRecord) -> bool:
+        """Whether what it said by now tells that it is another unit; one of another model may never answer the plan."""
+        return record.known.complaint(record.seen(), record.device.map.identity.growing) is not None
 
     def _verify(self, record: DeviceRecord) -> bool:
         """Rule 4."""

@@ -169,22 +169,25 @@ def test_one_that_could_not_say_what_it_is_is_taken_when_it_can() -> None:
     assert device.snapshot.state is DeviceState.ONLINE
 
 
-def test_another_model_in_its_place_is_another_unit_and_its_own_comes_back_whole() -> None:
-    prostar, tristar = SimulatedController(PROSTAR), SimulatedController(TRISTAR, plant=TS_60)
-    line = auto_line(prostar)
+@pytest.mark.parametrize("own", [PROSTAR, TRISTAR], ids=lambda device_map: device_map.model)
+def test_another_model_in_its_place_is_another_unit_and_its_own_comes_back_whole(own: DeviceMap) -> None:
+    units = {PROSTAR.model: SimulatedController(PROSTAR), TRISTAR.model: SimulatedController(TRISTAR, plant=TS_60)}
+    mine = units.pop(own.model)
+    (other,) = units.values()
+    line = auto_line(mine)
     (device,) = line.devices
     line.run(5.0)
     before = blocks_read(line)
     line.engine.closed("unplugged", line.now)
-    line.wire.stations[:] = [tristar]
+    line.wire.stations[:] = [other]
     line.engine.opened(line.now)
     line.run(10.0)
-    assert device.map is PROSTAR
+    assert device.map is own
     assert device.snapshot.warnings == {IDENTITY_MISMATCH}
     assert not device.snapshot.shown()
     assert isinstance(line.ask(device, BATTERY_REGULATION), IdentityUnproven)
     line.engine.closed("unplugged", line.now)
-    line.wire.stations[:] = [prostar]
+    line.wire.stations[:] = [mine]
     line.engine.opened(line.now)
     line.sent.clear()
     line.run(10.0)
