@@ -11,6 +11,7 @@ import signal
 import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
@@ -48,6 +49,8 @@ def command(
         raise typer.BadParameter(str(error)) from None
     if port.startswith("socket://") and len(speeds) > 1:
         raise typer.BadParameter("a socket:// port has the speed that its server was given; name one")
+    if "://" not in port:
+        port = str(Path(port).absolute())  # what is printed is a configuration, which wants it so
     settings = LineSettings(name="scan", index=1, port=port, baudrate=speeds[0], parity=parity, stopbits=stopbits)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -78,17 +78,18 @@ async def wired(folder: Path, wire: Wire, *stations: Station) -> AsyncIterator[P
         yield port
 
 
-async def scanning(*arguments: str) -> asyncio.subprocess.Process:
+async def scanning(*arguments: str, cwd: str | None = None) -> asyncio.subprocess.Process:
     return await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "gateway", "scan", *arguments),
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
+        cwd=cwd,
         env={**os.environ, "COLUMNS": "120"},
     )
 
 
-async def scanned(*arguments: str) -> tuple[int | None, str, str]:
-    process = await scanning(*arguments)
+async def scanned(*arguments: str, cwd: str | None = None) -> tuple[int | None, str, str]:
+    process = await scanning(*arguments, cwd=cwd)
     async with asyncio.timeout(60):
         said, complained = await process.communicate()
     return process.returncode, said.decode(), complained.decode()
@@ -110,7 +111,7 @@ async def test_a_line_is_found_as_it_is_and_nothing_is_written(tmp_path: Path) -
     )
     async with wired(tmp_path, wire, *stations) as port:
         arguments = ("--baudrates", str(FAST), "--addresses", "1-4,5-9", "--timeout-s", "0.05")
-        status, toml, said = await scanned(port.path, *arguments)
+        status, toml, said = await scanned(port.path.removeprefix("/"), *arguments, cwd="/")
     assert status == 0
     assert "5 found." in said
     assert addresses(toml) == [3, 5, 6, 8]
