@@ -90,6 +90,7 @@ class LogTail:
         self._view = view
         self._keys: list[tuple[int, int]] = []  # column and unit id, in the order of a walk
         self._version = -1
+        self._shown: dict[tuple[int, int], bool] = {}  # by key; a view does not change
 
     def through(self, view: View) -> LogTail:
         """What a view shows of it."""
@@ -161,7 +162,11 @@ class LogTail:
             return False
         if view is None:
             return True
-        return shows_all(view, (*self.base, column, unit))
+        key = (column, unit)
+        shown = self._shown.get(key)
+        if shown is None:
+            shown = self._shown[key] = shows_all(view, (*self.base, column, unit))
+        return shown
 
     def _cells(self, column: int, unit: int) -> Column | None:
         return self._days.by_unit.get(unit, {}).get(column)
