@@ -90,25 +90,23 @@ class FairQueue:
         best: tuple[float, float, str] | None = None
         best_read: ClientRead | None = None
         known: dict[int, bool] = {}  # unit id → whether its device is ready
-        for client, share in list(self._shares.items()):
-            self._prune(share)
+        idle: list[str] = []
+        for client, share in self._shares.items():
+            if not share.reads or share.reads[0].started or not share.reads[0].wanted:
+                self._prune(share)
             if not share.reads:
-                if share.used_s <= self._level_s or len(self._shares) > MAX_CLIENTS:
-                    del self._shares[client]
+                if share.used_s <= self._level_s or len(self._shares) - len(idle) > MAX_CLIENTS:
+                    idle.append(client)
                 continue
             read = share.reads[0]
             unit = read.device.unit_id
             if unit not in known:
                 known[unit] = ready(read.device)
-            if not known[unit]:
-                others = (r for r in share.reads if not r.started and r.wanted and ready(r.device))
-                found = next(others, None)
-                if found is None:
-                    continue
-                read = found
-            rank = (share.used_s, read.queued_at, client)
-            if best is None or rank < best:
-                best, best_read = rank, read
+            found = read if known[unit] else _first_ready(share, ready)
+            if found is not None and (best is None or (share.used_s, found.queued_at, client) < best):
+                best, best_read = (share.used_s, found.queued_at, client), found
+        for client in idle:
+            del self._shares[client]
         if best is not None:
             self._level_s = max(self._level_s, best[0])
         return best_read
@@ -191,3 +189,7 @@ class FairQueue:
                     self.take(read)
                     return read
         raise QueueFull
+
+
+def _first_ready(share: _Share, ready: Callable[[Device], bool]) -> ClientRead | None:
+    return next((read for read in share.reads if not read.started and read.wanted and ready(read.device)), None)

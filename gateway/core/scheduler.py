@@ -51,14 +51,15 @@ class PollList:
 
     def first(self) -> tuple[float, PollItem] | None:
         """The poll that is due first and when (rule 4); None when the device has none that is not under way."""
-        items = [item for item in self.items if not item.under_way]
-        if not items:
-            return None
         if self.breaker.probe_at is not None:
-            probe = next((item for item in items if item.purpose is Purpose.POLL), items[0])
-            return self.breaker.probe_at, probe
-        item = min(items, key=lambda item: item.due)
-        return item.due, item
+            items = [item for item in self.items if not item.under_way]
+            probe = next((item for item in items if item.purpose is Purpose.POLL), items[0] if items else None)
+            return None if probe is None else (self.breaker.probe_at, probe)
+        first: PollItem | None = None
+        for item in self.items:
+            if not item.under_way and (first is None or item.due < first.due):
+                first = item
+        return None if first is None else (first.due, first)
 
     def drop(self, item: PollItem) -> None:
         """It is not asked any more; when the device was restarted while it was under way, it is gone already."""

@@ -17,6 +17,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import lru_cache
 
 from pymodbus.pdu.mei_message import ReadDeviceInformationRequest, ReadDeviceInformationResponse
 
@@ -113,6 +114,7 @@ def is_exception(pdu: bytes) -> bool:
     return bool(pdu) and pdu[0] >= _EXCEPTION_BIT
 
 
+@lru_cache(maxsize=256)  # a request is looked at when it goes out, and when its reply comes
 def expected_reply_size(request: bytes) -> int | None:
     """Bytes of the normal reply PDU; None for Read Device Identification, where its content decides.
 

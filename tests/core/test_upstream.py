@@ -10,9 +10,11 @@ from gateway.core.budget import line_budget
 from gateway.core.requests import Lane
 from gateway.core.settings import PollSettings
 from gateway.core.site import Device, Outcome
-from gateway.core.snapshot import DeviceState
-from gateway.errors import LineDown, RelayedSilence, ReplyTimeout
+from gateway.core.snapshot import IDENTITY_MISMATCH, DeviceState
+from gateway.devices.schema import load_map
+from gateway.errors import IdentityUnproven, LineDown, RelayedSilence, ReplyTimeout
 from gateway.modbus.pdu import Function, ReadRequest
+from gateway.simulator.device import SimulatedController
 from gateway.simulator.upstream import Habits, SimulatedServer
 from tests.core.test_engine import Registers, registers
 from tests.core.virtual_upstream import VirtualUpstream, make_upstream
@@ -268,3 +270,21 @@ def test_every_read_ends_within_the_printed_deadline(silence: int | None) -> Non
     rig.run(90.0)
     assert len(ended) == 64
     assert max(ended) - began <= line_budget(rig.engine.settings, []).reply_deadline_s
+
+
+def test_another_controller_behind_a_server_that_was_away_is_not_taken_for_the_old_one() -> None:
+    prostar = load_map("prostar-mppt")
+    server = SimulatedServer([SimulatedController(prostar, address=1, seed=0)], habits=Habits(closes=True))
+    rig = make_upstream(server, [Device("array-1", 11, 1, prostar)])
+    rig.run(5.0)
+    assert states(rig) == [DeviceState.ONLINE]
+    server.refusing = True
+    rig.reset()
+    rig.run(5.0)
+    server.stations[:] = [SimulatedController(prostar, address=1, seed=1)]
+    server.refusing = False
+    rig.run(5.0)
+    assert DeviceState.ONLINE not in states(rig)
+    assert IDENTITY_MISMATCH in rig.devices[0].snapshot.warnings
+    assert isinstance(rig.ask(0, registers(0, 10)), IdentityUnproven)
+    assert rig.devices[0].snapshot.shown() == {}
