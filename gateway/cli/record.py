@@ -13,6 +13,7 @@ import socket
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -116,7 +117,8 @@ def _watch(config: Path, line: str, seconds: float) -> Iterator[str]:
         sock.settimeout(CONNECT_S)
         try:
             sock.connect(str(path))
-            sock.sendall(json.dumps(line).encode() + b"\n")
+            with suppress(BrokenPipeError):  # refused before it was asked: the reason is there to be read
+                sock.sendall(json.dumps(line).encode() + b"\n")
         except OSError as error:
             raise _Failed(f"the gateway cannot be asked at {path}: {error.strerror or error}") from None
         until = time.monotonic() + seconds

@@ -147,16 +147,17 @@ class LineEngine:
             self._polling.restart(record, now)
 
     def closed(self, error: str, now: float) -> None:
-        """The port is closed: what waited ends with LineDown, online devices become stale."""
+        """The port is closed: what waited ends with LineDown, or by rule 9; online devices become stale."""
         self._set_state(LineState.DOWN, error, now)
+        reason = ShuttingDown() if self._finishing else LineDown(error)
         self._wire.reset(now)
         for turn, sent_at in self._under_way.clear():
             self._records[turn.device.unit_id].doubt.missed(turn.pdu[0])
             self._accounting.ended(turn, sent_at, now, "line_down")
-            self._finish(waiters_of(turn), LineDown(error))
+            self._finish(waiters_of(turn), reason)
         for turn in self._aside.clear():
-            self._finish(waiters_of(turn), LineDown(error))
-        self._finish(self._scheduler.drain(), LineDown(error))
+            self._finish(waiters_of(turn), reason)
+        self._finish(self._scheduler.drain(), reason)
         for record in self._records.values():
             if record.state is DeviceState.ONLINE:
                 self._change(record, DeviceState.STALE, now, reason="line down")

@@ -48,7 +48,7 @@ def line_writes(rules: Sequence[WriteRule], devices: Sequence[Device]) -> bool:
 
 def rule_problems(tables: Sequence[tuple[Path, Raw]], devices: Sequence[Raw]) -> Iterator[Problem]:
     """What is wrong with `[[modbus.write]]` tables, beyond the form; `devices`: the raw `[[line.device]]` tables."""
-    named = {*models(), AUTO}
+    named = (*models(), AUTO)  # a tuple: what the file holds there may be no hashable thing
     known = [device for device in devices if device.get("model") in named and isinstance(device.get("unit_id"), int)]
     for path, table in tables:
         wanted = table.get("unit_id")

@@ -446,6 +446,21 @@ def test_a_line_that_stops_ends_the_transaction_on_the_wire_and_refuses_all_else
     assert len(line.sent) == count  # no poll either
 
 
+def test_what_a_stopping_line_cannot_end_is_refused_as_the_rest(virtual_line: MakeLine) -> None:
+    station = Registers(1)
+    line = virtual_line(station, reply_timeout_s=10.0)
+    line.run(10.0)
+    station.silent = True
+    outcomes: list[Outcome] = []
+    line.read(line.devices[0], registers(0x100, 2), outcomes.append)
+    while not any(sent[1][2:4] == b"\x01\x00" for sent in line.sent):
+        line.run(0.01)
+    line.engine.finish()
+    line.engine.closed("stopped", line.now)
+    line.run(0.01)
+    assert [type(outcome) for outcome in outcomes] == [ShuttingDown]
+
+
 def test_a_line_that_stops_repeats_nothing(virtual_line: MakeLine) -> None:
     station = Registers(1)
     line = virtual_line(station)

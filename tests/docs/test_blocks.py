@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 import socket
 import subprocess
 import sys
@@ -184,14 +183,13 @@ def test_commands_work_as_printed(
                 assert dry.returncode == 0
         elif command.startswith(".venv/bin/prostar-gateway generate"):
             assert run(tmp_path, f"{command.partition('#')[0]} --check") == ""
-        elif re.match(r"\.venv/bin/python tests/(bench|fuzz)/", command):
-            program = shlex.split(command)[1]
-            assert (ROOT / program).is_file()
+        elif program := re.match(r"\.venv/bin/python (?:-m )?(tests[./](?:bench|fuzz)[./]\S+)", command):
+            assert (ROOT / (program[1].removesuffix(".py").replace(".", "/") + ".py")).is_file()
             run(tmp_path, f"{command} --help")
         else:
-            for program in ("curl", "snmpwalk", "promtool"):
-                if program in command:
-                    peer(program)
+            for foreign in ("curl", "snmpwalk", "promtool"):
+                if foreign in command:
+                    peer(foreign)
             shown = run(tmp_path, on_the(request.getfixturevalue("site"), command, tmp_path))
             assert shown or ">" in command, f"{command}: shows nothing"
 

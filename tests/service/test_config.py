@@ -532,3 +532,9 @@ def test_the_defaults_of_the_file_are_those_of_the_face() -> None:
     assert settings.rate == defaults.rate
     assert settings.max_per_client == defaults.max_per_client
     assert settings.priority == defaults.priority
+
+
+@pytest.mark.parametrize("model", ["[]", "{ a = 1 }", "[[1], {}]", "1", "true"])
+def test_a_model_that_is_no_text_is_one_problem_beside_a_write_rule(model: str) -> None:
+    text = replaced('model = "prostar-mppt"', f"model = {model}") + WRITE + 'points = ["reset_control"]\n'
+    assert any(problem.startswith("line[0].device[0].model: ") for problem in problems(text))

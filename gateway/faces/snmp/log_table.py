@@ -67,7 +67,7 @@ def days_of(device_map: DeviceMap, days: Iterable[LoggedDay]) -> Days:
 
 
 class LogDays:
-    """The days of all devices; `version` counts how often they were changed."""
+    """The days of all devices; `version` counts how often a device got columns, or lost some."""
 
     def __init__(self) -> None:
         self.by_unit: dict[int, Days] = {}
@@ -75,8 +75,9 @@ class LogDays:
 
     def put(self, unit_id: int, days: Days) -> None:
         """The days of a device are these."""
+        if self.by_unit.get(unit_id, {}).keys() != days.keys():
+            self.version += 1  # days more or less leave the order of a walk as it is
         self.by_unit[unit_id] = days
-        self.version += 1
 
 
 class LogTail:
