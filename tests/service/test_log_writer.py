@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import logging
 import os
+import select
 import socket
 import time
 from collections.abc import Iterator
@@ -39,9 +40,9 @@ class Pipe:
     def read_all(self) -> list[str]:
         """Until the writer has nothing more."""
         data = b""
-        os.set_blocking(self.reading, True)
         while self.writer._queue or self.writer._writing:
-            data += os.read(self.reading, 1 << 20)
+            if select.select([self.reading], [], [], 0.05)[0]:  # it may have just written its last
+                data += os.read(self.reading, 1 << 20)
         return data.decode().splitlines() + self.read()
 
 
