@@ -41,10 +41,11 @@ class LogWriter(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Queue a record (rule 1)."""
-        if len(self._queue) >= LINES:
-            self._dropped += 1
-            self.stats.dropped += 1
-            return
+        with self._news:
+            if len(self._queue) >= LINES:
+                self._dropped += 1
+                self.stats.dropped += 1
+                return
         try:
             line = self._line(record)
         except Exception:  # noqa: BLE001 - a record that cannot be formatted is a mistake elsewhere, and no reason to fall
