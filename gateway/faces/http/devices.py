@@ -8,22 +8,23 @@ one series a named bit with the label `bit`. A number or a set bit that the map 
 while it lasts (`value_17`, `bit_9`), so that it cannot pass unseen. A text is one series of 1, with the text in a label
 that is called as the point is.
 
-A scrape costs what has changed: a device's lines are kept, and when its snapshot was replaced only those of
-points whose value is another one are written anew. All lines of a device in one scrape are of one snapshot.
+Nothing of a scrape is kept for the next one: lines are written a family at a time, all devices at once (columns.py).
+All lines of a scrape are of one moment.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from functools import lru_cache
 
 from gateway.core.site import Device, Site
 from gateway.core.snapshot import IDENTITY_MISMATCH, NOT_REWRITTEN, UNKNOWN_MODEL, DeviceState, Snapshot
-from gateway.devices.model import DeviceMap, Kind, Point, Value
+from gateway.devices.model import DeviceMap, Identification, Kind, Point
 from gateway.errors import MapError
+from gateway.faces.http.columns import Column, Shown, Tails, column_of, states
 from gateway.faces.http.metric import Labels, MetricInfo, MetricKind, gauge
-from gateway.faces.http.text import Lines, escaped, label_pairs, number, sample_lines
+from gateway.faces.http.text import Lines, label_pairs, number
 
 DEVICE_LABELS = ("device", "line", "model", "site", "unit_id")
 """Every metric of a device has these labels, first and in this order."""
@@ -82,137 +83,57 @@ def point_metric(point: Point) -> MetricInfo | None:
     return MetricInfo(point.metric, kind, point.help, labels)
 
 
-class _Writer(Protocol):
-    """How a point that is more than one series becomes lines."""
+class _Device:
+    """A device and its labels."""
 
-    def lines(self, labels: bytes, value: Value | str) -> bytes:
-        """The lines of the point's present value; `labels` are the device's."""
-        ...
+    __slots__ = ("_info", "_says", "closed", "device", "labels")
 
+    def __init__(self, device: Device, labels: bytes) -> None:
+        self.device = device
+        self.labels = labels
+        self.closed = labels + b"}"
+        self._says: tuple[Identification | None, str | None] = (None, None)
+        self._info: Tails = ()
 
-class _OneOf:
-    def __init__(self, metric: str, names: Mapping[int, str]) -> None:
-        self._begin = f"{metric}{{".encode()
-        self._names = {code: escaped(name).encode() for code, name in names.items()}
-
-    def lines(self, labels: bytes, value: Value | str) -> bytes:
-        begin = b'%b%b,state="' % (self._begin, labels)
-        out = [b'%b%b"} %d.0\n' % (begin, name, code == value) for code, name in self._names.items()]
-        if value not in self._names:
-            out.append(b'%bvalue_%d"} 1.0\n' % (begin, int(value)))
-        return b"".join(out)
-
-
-class _Bits:
-    def __init__(self, metric: str, names: Mapping[int, str]) -> None:
-        self._begin = f"{metric}{{".encode()
-        self._names = {bit: escaped(name).encode() for bit, name in names.items()}
-
-    def lines(self, labels: bytes, value: Value | str) -> bytes:
-        bits = int(value)
-        begin = b'%b%b,bit="' % (self._begin, labels)
-        named = [b'%b%b"} %d.0\n' % (begin, name, bits >> bit & 1) for bit, name in self._names.items()]
-        unnamed = [
-            b'%bbit_%d"} 1.0\n' % (begin, bit)
-            for bit in range(bits.bit_length())
-            if bits >> bit & 1 and bit not in self._names
-        ]
-        return b"".join(named + unnamed)
-
-
-class _Text:
-    def __init__(self, metric: str, label: str) -> None:
-        self._begin = f"{metric}{{".encode()
-        self._label = label.encode()
-
-    def lines(self, labels: bytes, value: Value | str) -> bytes:
-        return b'%b%b,%b="%b"} 1.0\n' % (self._begin, labels, self._label, escaped(str(value)).encode())
-
-
-def _writer(model: DeviceMap, point: Point, metric: str) -> _Writer | None:
-    if point.enumeration is not None:
-        return _OneOf(metric, {entry.number: entry.name for entry in model.enumerations[point.enumeration]})
-    if point.bits is not None:
-        return _Bits(metric, {bit.number: bit.name for bit in model.bit_tables[point.bits]})
-    if point.kind is Kind.TEXT:
-        return _Text(metric, point.name)
-    return None
+    def info(self, snapshot: Snapshot) -> Tails:
+        """What the device says of itself, nothing while it did not; hardly ever something else."""
+        says, serial_number = snapshot.identification, snapshot.serial_number
+        if (says, serial_number) != self._says:
+            self._says = (says, serial_number)
+            self._info = ()
+            if says is not None:
+                texts = (says.vendor, says.product, says.revision, serial_number or "")
+                self._info = (b"", b",%b} 1.0\n" % label_pairs(INFO.labels[len(DEVICE_LABELS) :], texts))
+        return self._info
 
 
 @dataclass(frozen=True, slots=True)
-class _Plan:
-    """How the points of one model are written: columns with one entry a point, first `points`, then `texts`."""
+class _Model:
+    """The devices of one model by unit id, and how its points are written, by metric."""
 
-    points: tuple[str, ...]
-    texts: tuple[str, ...]
-    families: tuple[int, ...]
-    begins: tuple[bytes, ...]  # how a plain number's line begins
-    scales: tuple[float, ...]  # what a plain number is multiplied by
-    writers: tuple[_Writer | None, ...]  # None: it is a plain number
+    devices: tuple[_Device, ...]
+    columns: Mapping[str, Column]
 
-
-class _DeviceLines:
-    """The lines of one device, kept from scrape to scrape."""
-
-    def __init__(self, device: Device, labels: bytes, plan: _Plan, families: int) -> None:
-        self.device = device
-        self.labels = labels
-        self._plan = plan
-        self._begins = tuple(begin + labels + b"}" for begin in plan.begins)
-        self._values: list[Value | str | None] = [None] * (len(plan.points) + len(plan.texts))
-        self._lines: Lines = (b"",) * families
-        self._written: Snapshot | None = None
-
-    def of_now(self) -> Lines:
-        """The lines of the present snapshot; never changed afterwards."""
-        snapshot = self.device.snapshot
-        if snapshot is self._written:
-            return self._lines
-        lines = list(self._lines)
-        before = self._written
-        if before is None or _status(before) != _status(snapshot):
-            lines[: len(DEVICE_METRICS)] = _status_lines(self.labels, snapshot)
-        plan = self._plan
-        values: list[Value | str | None] = list(map(snapshot.shown().get, plan.points))
-        if plan.texts:
-            values += map(snapshot.shown_texts().get, plan.texts)
-        columns = (values, self._values, plan.families, self._begins, plan.scales, plan.writers)
-        # The one loop that runs for every value of every device: tens of thousands of times a scrape.
-        for value, old, family, begin, scale, writer in zip(*columns, strict=True):
-            if value != old:
-                if value is None:
-                    lines[family] = b""
-                elif writer is not None:
-                    lines[family] = writer.lines(self.labels, value)
-                elif not isinstance(value, str):
-                    lines[family] = begin + number(value * scale)
-        self._values = values
-        self._written = snapshot
-        self._lines = lines
-        return lines
+    def look(self) -> tuple[tuple[_Device, Snapshot], ...]:
+        """The devices as they are now."""
+        return tuple((each, each.device.snapshot) for each in self.devices)
 
 
-def _status(snapshot: Snapshot) -> tuple[object, ...]:
-    return (snapshot.state, snapshot.identification, snapshot.serial_number, snapshot.warnings)
+def _shown(seen: Iterable[tuple[_Device, Snapshot]]) -> Shown:
+    online = [
+        (each.labels, each.closed, snapshot.shown(), snapshot.shown_texts())
+        for each, snapshot in seen
+        if snapshot.state is DeviceState.ONLINE
+    ]
+    return Shown(*zip(*online, strict=True)) if online else Shown((), (), (), ())
 
 
-def _status_lines(labels: bytes, snapshot: Snapshot) -> list[bytes]:
-    """The lines of `DEVICE_METRICS`; the age is not among them, for it changes without a snapshot."""
-    state = snapshot.state
-    states = (
-        sample_lines(STATE, b'%b,state="%b"' % (labels, each.value.encode()), each is state) for each in DeviceState
-    )
-    says = snapshot.identification
-    info = b""
-    if says is not None:
-        texts = (says.vendor, says.product, says.revision, snapshot.serial_number or "")
-        info = sample_lines(INFO, labels + b"," + label_pairs(INFO.labels[len(DEVICE_LABELS) :], texts), 1)
-    conditions = (
-        sample_lines(CONDITION, labels + b"," + label_pairs(("condition",), (each,)), each in snapshot.warnings)
-        for each in dict.fromkeys((*CONDITIONS, *sorted(snapshot.warnings)))
-    )
-    up = sample_lines(UP, labels, state is DeviceState.ONLINE)
-    return [up, b"", b"".join(states), info, b"".join(conditions)]
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """All devices of a site as they were at one moment; what is written of it is the same whenever it is written."""
+
+    devices: tuple[tuple[_Device, Snapshot], ...]
+    shown: tuple[tuple[_Model, Shown], ...]
 
 
 class DeviceMetrics:
@@ -221,54 +142,76 @@ class DeviceMetrics:
     def __init__(self, site: Site) -> None:
         """Prepare all families; MapError when two models give one metric name different labels or types."""
         self._families: dict[str, MetricInfo] = {info.name: info for info in DEVICE_METRICS}
-        plans = {
-            model.model: self._plan(model)
-            for model in {device.map.model: device.map for device in site.devices}.values()
-        }
-        self._devices = [
-            _DeviceLines(
-                device,
-                label_pairs(DEVICE_LABELS, device_labels(site, device)),
-                plans[device.map.model],
-                len(self._families),
-            )
-            for device in site.devices
-        ]
+        devices: dict[str, list[_Device]] = {}
+        for device in site.devices:
+            labels = label_pairs(DEVICE_LABELS, device_labels(site, device))
+            devices.setdefault(device.map.model, []).append(_Device(device, labels))
+        self._models = [_Model(tuple(each), self._columns(each[0].device.map)) for each in devices.values()]
 
-    def _plan(self, model: DeviceMap) -> _Plan:
-        columns: list[tuple[str, int, bytes, float, _Writer | None]] = []
-        for point in sorted(model.points, key=lambda point: point.kind is Kind.TEXT):
+    def _columns(self, model: DeviceMap) -> Mapping[str, Column]:
+        columns: dict[str, Column] = {}
+        for point in model.points:
             info = point_metric(point)
             if info is None:
                 continue
             known = self._families.setdefault(info.name, info)
             if (known.kind, known.labels) != (info.kind, info.labels):
                 raise MapError(f"{model.model}: point {point.name}: metric {info.name} has other labels elsewhere")
-            family = list(self._families).index(info.name)
-            begin = f"{info.name}{{".encode()
-            columns.append((point.name, family, begin, point.metric_scale, _writer(model, point, info.name)))
-        if not columns:
-            return _Plan((), (), (), (), (), ())
-        points, families, begins, scales, writers = zip(*columns, strict=True)
-        texts = tuple(name for name, *_, writer in columns if isinstance(writer, _Text))
-        return _Plan(points[: len(points) - len(texts)], texts, families, begins, scales, writers)
+            columns[info.name] = column_of(model, point, info.name)
+        return columns
 
-    def write(self) -> Iterator[Lines]:
-        """Each device's lines, written as far as they changed; a step of the iteration is one device."""
-        for lines in self._devices:
-            yield lines.of_now()
+    def look(self) -> Moment:
+        """The devices as they are now."""
+        seen = [(model, model.look()) for model in self._models]
+        return Moment(
+            tuple(each for _, devices in seen for each in devices),
+            tuple((model, _shown(devices)) for model, devices in seen),
+        )
 
-    def families(self, written: Sequence[Lines], now: float) -> Iterator[tuple[MetricInfo, Lines]]:
-        """Each family that has samples with the lines of all devices; `written` is what `write` gave."""
-        ages = self._ages(now)
-        for info, *lines in zip(self._families.values(), *written, strict=True):
-            present = ages if info is AGE else lines
-            if any(present):
-                yield info, present
+    def families(self, moment: Moment, now: float) -> Iterator[tuple[MetricInfo, Lines]]:
+        """Each family that has samples, with the lines of all devices, by model and unit id; `now` is for the ages."""
+        if moment.devices:
+            yield from _status(moment.devices, now)
+        for name, info in self._families.items():
+            pieces: list[bytes] = []
+            for model, shown in moment.shown:
+                if name in model.columns:
+                    pieces += model.columns[name].pieces(shown)
+            if pieces:
+                yield info, pieces
 
-    def _ages(self, now: float) -> Lines:
-        return [
-            sample_lines(AGE, each.labels, max(0.0, now - at))
-            for each in self._devices
-            if (at := each.device.snapshot.last_reply_at) is not None
-        ]
+
+def _status(seen: Sequence[tuple[_Device, Snapshot]], now: float) -> Iterator[tuple[MetricInfo, Lines]]:
+    """The families of `DEVICE_METRICS`, of one device or more."""
+    up = _begin(UP)
+    yield UP, [up + each.closed + number(snapshot.state is DeviceState.ONLINE) for each, snapshot in seen]
+    age = _begin(AGE)
+    ages = [
+        age + each.closed + number(max(0.0, now - snapshot.last_reply_at))
+        for each, snapshot in seen
+        if snapshot.last_reply_at is not None
+    ]
+    if ages:
+        yield AGE, ages
+    state = _begin(STATE)
+    yield STATE, [(state + each.labels).join(_STATES[snapshot.state]) for each, snapshot in seen]
+    info = _begin(INFO)
+    infos = [(info + each.labels).join(each.info(snapshot)) for each, snapshot in seen]
+    if any(infos):
+        yield INFO, infos
+    condition = _begin(CONDITION)
+    yield CONDITION, [(condition + each.labels).join(_conditions(snapshot.warnings)) for each, snapshot in seen]
+
+
+def _begin(info: MetricInfo) -> bytes:
+    return f"{info.name}{{".encode()
+
+
+_STATES: Mapping[DeviceState, Tails] = {
+    state: states("state", {each.value: each is state for each in DeviceState}) for state in DeviceState
+}
+
+
+@lru_cache(maxsize=64)
+def _conditions(warnings: frozenset[str]) -> Tails:
+    return states("condition", dict.fromkeys(CONDITIONS, False) | dict.fromkeys(sorted(warnings), True))

@@ -1,9 +1,9 @@
 """One scrape, made and handed out piece by piece, so that the loop is never held for long.
 
-Rule 1: first the lines of all devices are brought up to date, a few devices in one turn of the loop; from then on
-        nothing of the reply depends on later polls.
-Rule 2: the reply goes out in pieces of about `PIECE_BYTES`, each compressed in its own turn; no copy of the whole
-        is ever made.
+Rule 1: first the snapshots of all devices are taken, which are never changed; so nothing of the reply depends on later
+        polls, and it is of one moment.
+Rule 2: the reply is written and goes out in pieces of about `PIECE_BYTES`, each compressed in its own turn; no copy of
+        the whole is ever made, and none of a piece is kept.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from gateway.faces.http.own import Counts, OwnMetrics
 from gateway.faces.http.packing import packer
 from gateway.faces.http.text import Format, Lines, header
 
-DEVICES_A_TURN = 8
 PIECE_BYTES = 256 * 1024
 CLOCK_STEP_S = 60.0
 """By so much the wall clock is set; by less it is disciplined."""
@@ -61,20 +60,19 @@ class Exposition:
     async def pieces(self, form: Format) -> AsyncIterator[bytes]:
         """The exposition in pieces of about `PIECE_BYTES`, a turn of the loop between two of them."""
         devices, own = self._devices, self._own
-        written: list[Lines] = []
-        for lines in devices.write():
-            written.append(lines)
-            if len(written) % DEVICES_A_TURN == 0:
-                await asyncio.sleep(0)
-        piece = bytearray()
+        piece: list[bytes] = []
+        size = 0
         now = self._clock.monotonic()
-        for block in self._blocks(form, devices.families(written, now), own.families(now)):
-            piece += block
-            if len(piece) >= PIECE_BYTES:
-                yield bytes(piece)
+        for block in self._blocks(form, devices.families(devices.look(), now), own.families(now)):
+            piece.append(block)
+            size += len(block)
+            if size >= PIECE_BYTES:
+                whole = b"".join(piece)
                 piece.clear()
+                size = 0
+                yield whole
                 await asyncio.sleep(0)
-        yield bytes(piece)
+        yield b"".join(piece)
 
     def _blocks(self, form: Format, *metrics: Iterator[tuple[MetricInfo, Lines]]) -> Iterator[bytes]:
         for families in metrics:

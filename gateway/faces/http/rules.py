@@ -48,7 +48,10 @@ class Rule(Generic[T]):
         lines = []
         for source in sources:
             for extra, value in self.read(source.of):
-                labels = _with(source.written, info.labels, extra) if extra else source.written
+                labels = source.written
+                if extra:
+                    more = _pairs(info.labels, extra)
+                    labels = labels + b"," + more if labels else more
                 if labels and not isinstance(value, Histogram):  # nearly always
                     lines.append(begin + b"{" + labels + b"}" + number(value))
                 else:
@@ -56,11 +59,10 @@ class Rule(Generic[T]):
         return lines
 
 
-@lru_cache(maxsize=4096)
-def _with(written: bytes, names: Labels, extra: Labels) -> bytes:
-    """The labels of a source and those of its rule, which are the last of `names`."""
-    more = label_pairs(names[-len(extra) :], extra)
-    return written + b"," + more if written else more
+@lru_cache(maxsize=1024)
+def _pairs(names: Labels, extra: Labels) -> bytes:
+    """The labels of a rule, which are the last of `names`; the same for all sources, so few are worth keeping."""
+    return label_pairs(names[-len(extra) :], extra)
 
 
 def one(metric: MetricInfo, pick: Callable[[T], float]) -> Rule[T]:
