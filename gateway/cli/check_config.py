@@ -28,7 +28,7 @@ def command(config: ConfigOption) -> None:
     budgets = line_budgets(checked)
     console = Console()
     console.print(_lines(checked, budgets), _devices(checked, budgets), sep="\n")
-    modbus = f"Modbus TCP {_at(checked.modbus.listen)}{_tls(checked)}"
+    modbus = f"Modbus TCP {_at(checked.modbus.listen)}{_tls(checked)}{_of_lines(checked)}"
     for name, face in (("Faces", modbus), ("", f"SNMP {_snmp(checked)}"), ("", f"HTTP {_at(checked.http.listen)}")):
         console.print(f"{name:6} {face}", soft_wrap=True)
     if snmp_on(checked) and checked.snmp.emc1:
@@ -97,6 +97,12 @@ def _at(listen: Sequence[str]) -> str:
 def _tls(config: Config) -> str:
     tls = config.modbus.tls
     return "" if tls is None or not tls.listen else f" · Modbus TLS {_at(tls.listen)}"
+
+
+def _of_lines(config: Config) -> str:
+    """Which listeners stand for one line."""
+    shown = ((listener.line, "TLS " * listener.tls, _at(listener.listen)) for listener in config.modbus.listener)
+    return "".join(f" · line {escape(line)} {tls}{listen}" for line, tls, listen in shown)
 
 
 def _snmp(config: Config) -> str:

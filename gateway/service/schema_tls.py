@@ -6,6 +6,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
+from gateway.faces.modbus.tls_names import wanted_names
 from gateway.modbus.role import is_role
 from gateway.service.keys import LISTENS, Key, Listens, Table
 
@@ -19,7 +20,13 @@ def _role(text: str) -> str:
     return text
 
 
+def _client_name(text: str) -> str:
+    wanted_names([text])
+    return text
+
+
 Roles = Annotated[tuple[Annotated[str, AfterValidator(_role)], ...], Field(strict=False)]
+ClientNames = Annotated[tuple[Annotated[str, AfterValidator(_client_name)], ...], Field(strict=False)]
 File = Annotated[str, Field(pattern=r"^/[^\x00-\x1f]*$")]
 
 
@@ -37,3 +44,14 @@ class TlsTable(Table):
     require_role: Annotated[
         bool, Key("true or false", "Answer 01 to clients whose certificate has no role; false: they may read.")
     ] = True
+    client_names: Annotated[
+        ClientNames,
+        Key(
+            'a list of names such as "scada.example.net", "*.example.net", "10.1.2.3" or "10.1.2.0/28", at least one',
+            "Of these the subjectAltName of a client's certificate must have one; left out: whoever has a certificate.",
+        ),
+    ] = Field(default=(), min_length=1)
+    require_address: Annotated[
+        bool,
+        Key("true or false", "Refuse a client that connects from an address which its certificate does not name."),
+    ] = False

@@ -13,6 +13,7 @@ from pathlib import Path
 from gateway.errors import TlsFilesError
 from gateway.faces.modbus.settings import TlsSettings
 from gateway.faces.modbus.tls_files import TlsFiles, exposed_key, load
+from gateway.faces.modbus.tls_names import Names, wanted_names
 from gateway.service.keys import parse_listen
 from gateway.service.schema import Config
 
@@ -33,6 +34,8 @@ def tls_settings(config: Config) -> TlsSettings | None:
             Path(tls.crl_file) if tls.crl_file else None,
         ),
         require_role=tls.require_role,
+        client_names=wanted_names(tls.client_names) if tls.client_names else None,
+        require_address=tls.require_address,
     )
 
 
@@ -59,10 +62,27 @@ def tls_advice(config: Config, now: float) -> Iterator[str]:
     if exposed_key(settings.files):
         yield f"modbus.tls.key_file: {settings.files.key} can be read by every user of this machine"
     try:
-        left_s = load(settings.files, now).not_after - now
+        credentials = load(settings.files, now)
     except TlsFilesError as error:
         for key, text in error.problems:
             yield f"modbus.tls.{key}: {text}; the TLS port stays closed until that is mended"
         return
+    left_s = credentials.not_after - now
     if left_s < SOON_S:
         yield f"modbus.tls.certificate_file: expires in {left_s / 86400:.0f} days"
+    yield from _own_names(config, credentials.names)
+
+
+def _own_names(config: Config, names: Names) -> Iterator[str]:
+    """What a client that checks whom it talks to (RFC 9525) will not like about the server's certificate."""
+    refused = "so clients that check whom they talk to refuse it"
+    if not (names.dns or names.addresses):
+        yield f"modbus.tls.certificate_file: names nobody, for it has no subjectAltName, {refused}"
+        return
+    tls = config.modbus.tls
+    tables = [("modbus.tls", () if tls is None else tls.listen)]
+    tables += [(f"modbus.listener[{at}]", each.listen) for at, each in enumerate(config.modbus.listener) if each.tls]
+    for path, listen in tables:
+        for at, text in enumerate(listen):
+            if not names.lead_to(parse_listen(text).host):
+                yield f"{path}.listen[{at}]: the server's certificate is for {names}, not for {text}, {refused}"

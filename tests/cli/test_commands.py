@@ -52,7 +52,8 @@ def test_check_config_shows_what_the_lines_can_do() -> None:
     by_unit = {row[0]: row for row in rows if len(row) > 5 and row[0].isdigit()}
     assert list(by_unit) == ["11", "12", "13", "14", "15"]
     assert by_unit["13"] == ["13", "array-3", "shelter-b", "1", "prostar-mppt", "1.0", "s", "300", "s"]
-    assert "Faces  Modbus TCP 127.0.0.1:1502\n       SNMP 127.0.0.1:1161\n       HTTP 127.0.0.1:9850\n" in shown
+    modbus = "Modbus TCP 127.0.0.1:1502 · line shelter-a 127.0.0.1:1503"
+    assert f"Faces  {modbus}\n       SNMP 127.0.0.1:1161\n       HTTP 127.0.0.1:9850\n" in shown
     assert "EMC-1  unit 11 127.0.0.1:1162\n" in shown
     assert "warning snmp.enterprise_root: 32473" in shown
     assert shown.endswith("full.toml is right.\n")

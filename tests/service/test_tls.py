@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable
+from ipaddress import ip_network
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,11 @@ import pytest
 from gateway.core.write_rules import Requester
 from gateway.errors import ConfigError
 from gateway.faces.modbus.settings import LineListen
+from gateway.faces.modbus.tls_names import WantedNames
 from gateway.service.advice import advice
 from gateway.service.config import Config, parse_config
 from gateway.service.settings import line_budgets, modbus_settings
-from gateway.service.tls import tls_problems, tls_settings
+from gateway.service.tls import tls_advice, tls_problems, tls_settings
 from gateway.service.writes import write_rules
 from tests.faces.modbus.tls.site import SERVER, Pki, run
 
@@ -93,6 +95,13 @@ def test_the_only_way_in_by_tls_may_be_the_port_of_a_line(pki: Pki) -> None:
             '[[modbus.write]]\nrole = ["a\\nb"]\n',
             'modbus.write[0].role[0]: "a\\nb" is not allowed; allowed: a list of roles',
         ),
+        (TLS + "client_names = []\n", 'modbus.tls.client_names: is empty; allowed: a list of names such as "scada'),
+        (
+            TLS + 'client_names = ["scada.example.net", "10.1.2.1/28"]\n',  # host bits in a network: a slip of the pen
+            'modbus.tls.client_names[1]: "10.1.2.1/28" is not allowed; allowed: a list of names',
+        ),
+        (TLS + 'client_names = ["scada..net"]\n', 'modbus.tls.client_names[0]: "scada..net" is not allowed; '),
+        (TLS + 'client_names = ["a.*.net"]\n', 'modbus.tls.client_names[0]: "a.*.net" is not allowed; '),
         ("[[modbus.write]]\nrole = []\n", "modbus.write[0].role: is empty; allowed: a list of roles"),
         ('[[modbus.write]]\npoint = ["modbus_id"]\n', "modbus.write[0]: holds for nobody; allowed: source or role"),
     ],
@@ -133,6 +142,61 @@ def test_what_is_worth_a_second_look(pki: Pki) -> None:
     told = advice(config(pki), line_budgets(config(pki)))
     assert f"modbus.tls.key_file: {pki.folder}/server.key can be read by every user of this machine" in told
     assert "modbus.tls.certificate_file: expires in 9 days" in told
+
+
+def test_whose_certificates_are_wanted_comes_from_the_file(pki: Pki) -> None:
+    settings = tls_settings(config(pki))
+    assert settings is not None
+    assert (settings.client_names, settings.require_address) == (None, False)
+    settings = tls_settings(config(pki, 'client_names = ["SCADA.example.net", "10.1.2.3"]\nrequire_address = true\n'))
+    assert settings is not None
+    assert settings.client_names == WantedNames(frozenset({"scada.example.net"}), (ip_network("10.1.2.3/32"),))
+    assert settings.require_address
+
+
+REFUSED = ", so clients that check whom they talk to refuse it"
+
+
+@pytest.mark.parametrize(
+    ("names", "listen", "told"),
+    [
+        ((), "127.0.0.1:802", "modbus.tls.certificate_file: names nobody, for it has no subjectAltName"),
+        (("gateway.example.net",), "127.0.0.1:802", "DNS:gateway.example.net, not for 127.0.0.1:802"),
+        (("localhost", "127.0.0.1"), "192.0.2.7:802", "DNS:localhost, IP:127.0.0.1, not for 192.0.2.7:802"),
+        (("localhost", "127.0.0.1"), "0.0.0.0:802", "DNS:localhost, IP:127.0.0.1, not for 0.0.0.0:802"),
+        (("192.0.2.7",), "[::]:802", "IP:192.0.2.7, not for [::]:802"),
+        (("192.0.2.8", "2001:db8::7"), "192.0.2.7:802", "IP:192.0.2.8, IP:2001:db8::7, not for 192.0.2.7:802"),
+        (("localhost",), "127.0.0.1:802", None),
+        (("127.0.0.1",), "127.0.0.1:802", None),
+        (("gateway.example.net",), "192.0.2.7:802", None),
+        (("*.example.net",), "0.0.0.0:802", None),
+        (("192.0.2.7",), "192.0.2.7:802", None),
+        (("192.0.2.7",), "0.0.0.0:802", None),
+        (("2001:db8::7",), "[2001:db8:0::7]:802", None),
+    ],
+)
+def test_a_server_of_another_name_is_told(pki: Pki, names: tuple[str, ...], listen: str, told: str | None) -> None:
+    pki.issue("server", usage=SERVER, names=names, days=(-1, 100))
+    said = list(tls_advice(config(pki, f'listen = ["{listen}"]\n'), time.time()))
+    if told is None:
+        assert not said
+    elif names:
+        assert said == [f"modbus.tls.listen[0]: the server's certificate is for {told}{REFUSED}"]
+    else:
+        assert said == [told + REFUSED]
+
+
+def test_each_listener_through_tls_wants_a_name(pki: Pki) -> None:
+    more = """listen = ["127.0.0.1:802", "[::1]:802"]
+[[modbus.listener]]
+line = "shelter-a"
+listen = ["127.0.0.1:1503", "192.0.2.7:1503"]
+tls = true
+"""
+    pki.issue("server", usage=SERVER, names=("127.0.0.1",), days=(-1, 100))
+    told = list(tls_advice(config(pki, more), time.time()))
+    assert [text.partition(":")[0] for text in told] == ["modbus.tls.listen[1]", "modbus.listener[0].listen[1]"]
+    assert not list(tls_advice(config(pki, more.replace("tls = true", "").replace(', "[::1]:802"', "")), time.time()))
 
 
 def test_a_role_without_tls_is_told() -> None:

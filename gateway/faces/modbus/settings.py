@@ -10,6 +10,7 @@ from gateway.core.ratelimit import ClientRate, LineRates
 from gateway.core.write_rules import WriteRule
 from gateway.core.write_wear import WearLimits
 from gateway.faces.modbus.tls_files import TlsFiles
+from gateway.faces.modbus.tls_names import WantedNames
 
 Network = IPv4Network | IPv6Network
 
@@ -54,11 +55,13 @@ class WriteSettings:
 
 @dataclass(frozen=True, slots=True)
 class TlsSettings:
-    """Modbus/TCP Security: where, by which files, and what a certificate without a role is good for."""
+    """Modbus/TCP Security: where, by which files, whose certificates, and what one without a role is good for."""
 
     listen: tuple[tuple[str, int], ...]
     files: TlsFiles
     require_role: bool = True  # False: who has no role may read
+    client_names: WantedNames | None = None  # a client's certificate has one of these; None: any, or no name at all
+    require_address: bool = False  # True: a client's certificate has the address that the client connects from
     handshake_timeout_s: float = 5.0
 
 

@@ -5,11 +5,13 @@ Rule 1: who comes in has shown a certificate that the configured CA stands for, 
         (R-04, R-30); the role decides on every request, refused with 01 (R-31).
 Rule 2: a certificate without a role has the least rights: none, or to read where `require_role` is off (R-23). A role
         that no rule names is no more than that it is one.
-Rule 3: a handshake that fails is counted under its reason, and told once a minute for each peer and reason.
-Rule 4: a handshake takes as long as `HANDSHAKE_TOKENS` requests from memory, and costs its client as many of its tokens
+Rule 3: where there are `client_names`, the certificate has one of them; with `require_address` it names the address
+        that the client connects from (tls_names.py). By itself neither lets anybody in.
+Rule 4: a handshake that fails is counted under its reason, and told once a minute for each peer and reason.
+Rule 5: a handshake takes as long as `HANDSHAKE_TOKENS` requests from memory, and costs its client as many of its tokens
         (core/clients.py), or those that it has; who has none is cut off before it begins.
-Rule 5: `adjust` takes files that were judged good together. Open connections go on, but those whose certificate is now
-        revoked end.
+Rule 6: `adjust` takes files that were judged good together, and settings. Open connections go on, but those that would
+        not be let in any more end.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from gateway.faces.modbus.connection import Connection
 from gateway.faces.modbus.dispatch import Dispatcher
 from gateway.faces.modbus.settings import TlsSettings
 from gateway.faces.modbus.tls_files import Credentials, load
+from gateway.faces.modbus.tls_names import names_of
 from gateway.faces.modbus.tls_session import TlsSession
 from gateway.modbus.role import ROLE_OID, parse_role
 
@@ -62,25 +65,26 @@ class TlsDoor:
             self._stats.problem = str(error)
             raise
 
-    def _take(self, credentials: Credentials) -> None:
+    def adjust(self, settings: TlsSettings, credentials: Credentials) -> None:
+        """Other settings and their files, which were judged good, from now on (rule 6).
+
+        Who was let in to read without a role is cut off when it needs one now.
+        """
+        role_required = settings.require_role and not self._settings.require_role
+        self._settings = settings
         self._use(credentials)
         logger.info("event=tls_reloaded")
         for session, certificate in tuple(self._sessions.items()):
+            connection = session.connection
             if credentials.revoked(certificate):
-                logger.warning("event=connection_ended peer=%s reason=certificate_revoked", session.connection.peer)
-                session.connection.end("certificate_revoked")
-
-    def adjust(self, settings: TlsSettings, credentials: Credentials) -> None:
-        """Other settings and their files, which were judged good, from now on (rule 5).
-
-        Who was let in without a role is cut off when it needs one now.
-        """
-        stricter = settings.require_role and not self._settings.require_role
-        self._settings = settings
-        self._take(credentials)
-        for session in tuple(self._sessions) if stricter else ():
-            if session.connection.role is None:
-                session.connection.end("role_required")
+                reason = "certificate_revoked"
+            elif role_required and connection.role is None:
+                reason = "role_required"
+            else:
+                reason = self._misnamed(certificate, connection.peer)
+            if reason:
+                logger.warning("event=connection_ended peer=%s reason=%s", connection.peer, reason)
+                connection.end(reason)
 
     def session(self, connection: Connection) -> TlsSession:
         """What stands between a socket and a new connection."""
@@ -94,7 +98,7 @@ class TlsDoor:
     # What the sessions call (tls_session.Door)
 
     def affords(self, client: Client) -> bool:
-        """Whether a client may shake hands now (rule 4)."""
+        """Whether a client may shake hands now (rule 5)."""
         return client.bucket.take(self._clock.monotonic(), HANDSHAKE_TOKENS) > 0
 
     def context(self) -> ssl.SSLContext:
@@ -103,8 +107,11 @@ class TlsDoor:
         return self._credentials.context()
 
     def enter(self, session: TlsSession, certificate: bytes) -> None:
-        """Let a client in by the role of its certificate (rules 1 and 2)."""
+        """Let a client in by the names and the role of its certificate (rules 1 to 3)."""
         parsed, role = _identify(certificate)
+        misnamed = self._misnamed(parsed, session.connection.peer)
+        if misnamed:
+            raise CertificateRefused(misnamed, f"its names: {names_of(parsed)}")
         self._sessions[session] = parsed
         self._stats.handshakes += 1
         if role is None and self._settings.require_role:
@@ -117,12 +124,13 @@ class TlsDoor:
             peer, serial = session.connection.peer, parsed.serial_number
             logger.info("event=tls_client peer=%s role=%s certificate=%x left_out=%d", peer, shown, serial, left_out)
 
-    def refuse(self, peer: str, reason: str) -> None:
-        """Count and tell a handshake that failed (rule 3)."""
+    def refuse(self, peer: str, reason: str, why: str = "") -> None:
+        """Count and tell a handshake that failed (rule 4)."""
         self._stats.refused[reason] += 1
         left_out = self._told.spend(("out", peer, reason), self._clock.monotonic())
         if left_out is not None:
-            logger.warning("event=tls_refused peer=%s reason=%s left_out=%d", peer, reason, left_out)
+            more = f' why="{why}"' if why else ""
+            logger.warning("event=tls_refused peer=%s reason=%s left_out=%d%s", peer, reason, left_out, more)
 
     def left(self, session: TlsSession) -> None:
         """A session is over."""
@@ -134,6 +142,15 @@ class TlsDoor:
         self._stats.problem = problem
         kept = "none" if self._credentials is None else "old"
         logger.error('event=tls_reload_failed kept=%s error="%s"', kept, problem.replace('"', "'"))
+
+    def _misnamed(self, certificate: x509.Certificate, peer: str) -> str:
+        """Why a certificate is not let in from an address by its names (rule 3); "" when it is."""
+        settings, names = self._settings, names_of(certificate)
+        if settings.client_names is not None and not settings.client_names.fit(names):
+            return "name_not_allowed"
+        if settings.require_address and not names.hold(peer):
+            return "address_not_in_certificate"
+        return ""
 
     def _use(self, credentials: Credentials) -> None:
         self._credentials = credentials
@@ -150,6 +167,6 @@ def _identify(der: bytes) -> tuple[x509.Certificate, str | None]:
         reason = "role_malformed" if error.oid == _OID else "certificate_unreadable"
         raise CertificateRefused(reason, "an extension comes twice") from None
     except (ValueError, x509.InvalidVersion, x509.UnsupportedGeneralNameType) as error:
-        raise CertificateRefused("certificate_unreadable", str(error)) from None
+        raise CertificateRefused("certificate_unreadable", "an extension, or all of it") from error
     values = [e.value.value for e in extensions if isinstance(e.value, x509.UnrecognizedExtension) and e.oid == _OID]
     return certificate, parse_role(values)

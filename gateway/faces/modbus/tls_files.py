@@ -28,6 +28,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat,
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from gateway.errors import TlsFilesError
+from gateway.faces.modbus.tls_names import Names, names_of
 
 MAX_BYTES = 1 << 20
 CIPHERS = (
@@ -65,12 +66,13 @@ class TlsFiles:
 
 
 class Credentials:
-    """Files that were judged good; `not_after` (Unix time) is when the server's certificate expires."""
+    """Files that were judged good: until when (Unix time) the server's certificate is, and whose it is."""
 
     def __init__(
-        self, files: dict[str, bytes], crls: Sequence[x509.CertificateRevocationList], not_after: float
+        self, files: dict[str, bytes], crls: Sequence[x509.CertificateRevocationList], own: x509.Certificate
     ) -> None:
-        self.not_after = not_after
+        self.not_after = own.not_valid_after_utc.timestamp()
+        self.names: Names = names_of(own)
         self._crls = tuple(crls)
         self._kept = {key: os.memfd_create(key, os.MFD_CLOEXEC) for key in files}
         weakref.finalize(self, _close, tuple(self._kept.values()))
@@ -123,7 +125,7 @@ def load(files: TlsFiles, now: float) -> Credentials:
     _judge_key(chain, found, problems)
     if problems:
         raise TlsFilesError(tuple(problems))
-    credentials = Credentials(found, crls, chain[0].not_valid_after_utc.timestamp())
+    credentials = Credentials(found, crls, chain[0])
     try:
         credentials.context()
     except ssl.SSLError as error:

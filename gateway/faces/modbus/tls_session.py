@@ -53,7 +53,8 @@ _SSL_REASONS = {
 }
 REASONS = frozenset(
     {*_VERIFY_REASONS.values(), *_SSL_REASONS.values(), "certificate_invalid", "role_malformed", "refused_by_client"}
-    | {"certificate_unreadable", "timeout", "hung_up", "rate_limited", "protocol_error", "internal"}
+    | {"name_not_allowed", "address_not_in_certificate", "certificate_unreadable"}
+    | {"timeout", "hung_up", "rate_limited", "protocol_error", "internal"}
 )
 """Every label under which a failed handshake is counted."""
 
@@ -73,8 +74,8 @@ class Door(Protocol):
         """Let a client with this certificate (DER) in; CertificateRefused when it cannot be served."""
         ...
 
-    def refuse(self, peer: str, reason: str) -> None:
-        """A handshake failed."""
+    def refuse(self, peer: str, reason: str, why: str = "") -> None:
+        """A handshake failed; `why` says more than the reason, in words without quotes."""
         ...
 
     def left(self, session: TlsSession) -> None:
@@ -252,7 +253,7 @@ class TlsSession(asyncio.Transport, asyncio.Protocol):
             return False
         except CertificateRefused as error:
             self._done = True  # so that the client is told properly that it ends
-            self._refuse(error.reason)
+            self._refuse(error.reason, str(error))
             return False
         self._done = True
         return True
@@ -289,12 +290,12 @@ class TlsSession(asyncio.Transport, asyncio.Protocol):
         elif not self._closing and not self.connection.eof_received():
             self.close()
 
-    def _refuse(self, reason: str) -> None:
+    def _refuse(self, reason: str, why: str = "") -> None:
         if self._failed:
             return
         self._failed = True
         self._stop_timer()
-        self._door.refuse(self.connection.peer, reason)
+        self._door.refuse(self.connection.peer, reason, why)
         self.connection.end("tls_refused")
 
     def _flush(self) -> None:

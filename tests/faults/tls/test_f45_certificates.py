@@ -4,20 +4,30 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 import ssl
+import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
+from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
+from gateway.faces.modbus.tls_files import load
+from gateway.faces.modbus.tls_names import wanted_names
+from gateway.faces.modbus.tls_session import REASONS
+from gateway.modbus import mbap
 from tests.faces.modbus.conftest import read
 from tests.faces.modbus.tls.conftest import ServeTls, TlsSite
-from tests.faces.modbus.tls.site import SERVER, Pki
+from tests.faces.modbus.tls.site import SERVER, Pki, role, utf8
+from tests.faces.modbus.tls.test_tls_serving import s_client
 
 pytestmark = pytest.mark.peer
 
 Make = Callable[[Pki], str | None]
 PDU, REPLY = read(11, 0, 4)
+READER = role(utf8("reader"))
 
 
 def none(pki: Pki) -> str | None:
@@ -87,6 +97,14 @@ async def test_f45_it_is_refused_and_others_are_served(
 ) -> None:
     site = await serve_tls()
     name = make(site.pki)
+    await is_refused_and_told_once_a_minute(site, caplog, name, reason, version)
+
+
+async def is_refused_and_told_once_a_minute(
+    site: TlsSite, caplog: pytest.LogCaptureFixture, name: str | None, reason: str, version: ssl.TLSVersion
+) -> None:
+    """Three times, and once more a minute later, while the reader is served; and every time counted."""
+    assert reason in REASONS
     good = await site.connect("reader")
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
@@ -95,13 +113,13 @@ async def test_f45_it_is_refused_and_others_are_served(
     await site.running.until(lambda: site.stats.refused.total() == 3)
     assert site.stats.refused == {reason: 3}
     assert site.world.stats.requests == 3
-    told = [text for text in caplog.messages if "tls_refused" in text]
-    assert told == [f"event=tls_refused peer=127.0.0.1 reason={reason} left_out=0"]  # once a minute
+    (told,) = [text for text in caplog.messages if "tls_refused" in text]
+    assert told.startswith(f"event=tls_refused peer=127.0.0.1 reason={reason} left_out=0")
     site.world.clock.now += 61
     with caplog.at_level(logging.WARNING):
         await is_refused(site, name, version)
         await site.running.until(lambda: site.stats.refused.total() == 4)
-    assert caplog.messages[-1] == f"event=tls_refused peer=127.0.0.1 reason={reason} left_out=2"
+    assert caplog.messages[-1] == told.replace("left_out=0", "left_out=2")
 
 
 @pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1, ssl.TLSVersion.TLSv1_1])
@@ -146,3 +164,163 @@ async def test_f45_a_revoked_certificate_is_refused(serve_tls: ServeTls, pki: Pk
     await is_refused(site, "operator")
     assert await (await site.connect("reader")).query(11, PDU) == REPLY
     assert site.stats.refused == {"certificate_revoked": 1}
+
+
+OPERATORS = ("scada.example.net", "*.control.example.net", "10.1.2.0/28", "2001:db8::7")
+
+
+@pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3])
+@pytest.mark.parametrize(
+    "shown",
+    [
+        "none",
+        "DNS:historian.example.net, IP:192.0.2.9",
+        "DNS:scada.example.net.example.org, DNS:scada.example, DNS:example.net",
+        "DNS:control.example.net, DNS:a.b.control.example.net",
+        "DNS:*.control.example.net",
+        "DNS:10.1.2.7.example.net, IP:10.1.2.16, IP:2001:db8::8",
+    ],
+)
+async def test_f45_a_certificate_of_another_name_is_refused(
+    serve_tls: ServeTls, caplog: pytest.LogCaptureFixture, shown: str, version: ssl.TLSVersion
+) -> None:
+    site = await serve_tls(tls={"client_names": wanted_names((*OPERATORS, "reader.example.net"))})
+    site.pki.issue("reader", names=("reader.example.net",), extensions=[READER])
+    names = [] if shown == "none" else [text.partition(":")[2] for text in shown.split(", ")]
+    site.pki.issue("stranger", names=names, extensions=[READER])
+    await is_refused_and_told_once_a_minute(site, caplog, "stranger", "name_not_allowed", version)
+    assert caplog.messages[-1].endswith(f'why="its names: {shown}"')
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("scada.example.net",),
+        ("SCADA.Example.NET",),
+        ("elsewhere.example.net", "scada.example.net"),
+        ("desk-7.control.example.net",),
+        ("10.1.2.15",),
+        ("2001:db8:0::7",),
+    ],
+)
+async def test_f45_one_name_that_is_wanted_is_enough(serve_tls: ServeTls, pki: Pki, names: tuple[str, ...]) -> None:
+    site = await serve_tls(tls={"client_names": wanted_names(OPERATORS)})
+    pki.issue("someone", names=names, extensions=[READER])
+    assert await (await site.connect("someone")).query(11, PDU) == REPLY
+    assert site.stats.refused.total() == 0
+
+
+async def test_f45_no_other_entry_and_no_common_name_is_taken_for_a_name(serve_tls: ServeTls, pki: Pki) -> None:
+    site = await serve_tls(tls={"client_names": wanted_names(OPERATORS)})
+    others = x509.SubjectAlternativeName(
+        [
+            x509.RFC822Name("scada.example.net"),
+            x509.UniformResourceIdentifier("scada.example.net"),
+            x509.DNSName("scada.example.net\0.example.org"),
+        ]
+    )
+    pki.issue("scada.example.net", names=(), extensions=[READER, others])  # that is its common name too
+    await is_refused(site, "scada.example.net")
+    assert site.stats.refused == {"name_not_allowed": 1}
+
+
+async def test_f45_a_certificate_is_good_at_its_own_address_only(
+    serve_tls: ServeTls, pki: Pki, caplog: pytest.LogCaptureFixture
+) -> None:
+    site = await serve_tls(tls={"require_address": True})
+    pki.issue("reader", names=("localhost", "127.0.0.1"), extensions=[READER])
+    pki.issue("away", names=("localhost", "127.0.0.2", "127.0.0.3"), extensions=[READER])
+    for host in ("127.0.0.2", "127.0.0.3"):
+        assert await (await site.connect("away", local_addr=(host, 0))).query(11, PDU) == REPLY
+    site.world.stats.requests -= 2
+    version = ssl.TLSVersion.TLSv1_3
+    await is_refused_and_told_once_a_minute(site, caplog, "away", "address_not_in_certificate", version)
+
+
+async def test_f45_the_certificates_of_the_recipe_have_names_to_tell_them_by(serve_tls: ServeTls) -> None:
+    site = await serve_tls(tls={"client_names": wanted_names(["scada.example.net"])})
+    assert await (await site.connect("operator")).query(11, PDU) == REPLY
+    await is_refused(site, "reader")
+    assert site.stats.refused == {"name_not_allowed": 1}
+
+
+async def test_f45_both_conditions_must_hold(serve_tls: ServeTls, pki: Pki) -> None:
+    site = await serve_tls(tls={"client_names": wanted_names(OPERATORS), "require_address": True})
+    for name, names in (
+        ("both", ("scada.example.net", "127.0.0.1")),
+        ("name", OPERATORS[:1]),
+        ("here", ("127.0.0.1",)),
+    ):
+        pki.issue(name, names=names, extensions=[READER])
+    assert await (await site.connect("both")).query(11, PDU) == REPLY
+    await is_refused(site, "name")
+    await is_refused(site, "here")
+    assert site.stats.refused == {"address_not_in_certificate": 1, "name_not_allowed": 1}
+
+
+async def test_f45_names_wanted_from_a_reload_on_end_the_connections_without(
+    serve_tls: ServeTls, pki: Pki, caplog: pytest.LogCaptureFixture
+) -> None:
+    site = await serve_tls()
+    pki.issue("scada", names=OPERATORS[:1], extensions=[READER])
+    scada, reader = await site.connect("scada"), await site.connect("reader")
+    await site.running.until(lambda: site.stats.handshakes == 2)
+    before = site.running.server.settings.tls
+    assert before is not None
+    with caplog.at_level(logging.WARNING):
+        site.door.adjust(replace(before, client_names=wanted_names(OPERATORS)), load(before.files, time.time()))
+    assert await reader.rest() == b""
+    assert await scada.query(11, PDU) == REPLY
+    assert "event=connection_ended peer=127.0.0.1 reason=name_not_allowed" in caplog.messages
+    assert site.world.stats.closed == {"name_not_allowed": 1}
+
+
+# The other way round: a client that checks whose certificate the server has
+
+
+@pytest.mark.parametrize(
+    "check",
+    [("-verify_hostname", "localhost"), ("-verify_hostname", "gateway.example.net"), ("-verify_ip", "127.0.0.1")],
+)
+async def test_f45_the_certificate_of_the_recipe_stands_the_check_of_a_client(
+    serve_tls: ServeTls, peer: Callable[[str], str], check: tuple[str, str]
+) -> None:
+    site = await serve_tls()
+    request, reply = mbap.encode(7, 11, PDU), mbap.encode(7, 11, REPLY)
+    got, said = await s_client(site, peer("openssl"), "-quiet", "-no_ign_eof", *check, request=request)
+    assert got == reply, said
+
+
+@pytest.mark.parametrize("version", ["-tls1_2", "-tls1_3"])
+@pytest.mark.parametrize(
+    "check", [("-verify_hostname", "another.example.net"), ("-verify_ip", "192.0.2.7"), ("-verify_ip", "127.0.0.2")]
+)
+async def test_f45_a_client_that_expects_another_server_does_not_talk(
+    serve_tls: ServeTls, peer: Callable[[str], str], check: tuple[str, str], version: str
+) -> None:
+    site = await serve_tls()
+    _, said = await s_client(site, peer("openssl"), version, *check)
+    assert "mismatch" in said
+    await site.running.until(lambda: site.stats.refused.total() == 1)
+    assert site.stats.refused == {"refused_by_client": 1}
+    assert site.world.stats.requests == 0
+
+
+def shake_hands(context: ssl.SSLContext, address: tuple[str, int]) -> None:
+    """As a client that connects to "localhost" and sees to it that it is there."""
+    assert context.check_hostname
+    with socket.create_connection(address, timeout=10) as plain:
+        context.wrap_socket(plain, server_hostname="localhost").close()
+
+
+@pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3])
+@pytest.mark.parametrize("names", [(), ("elsewhere.example.net", "127.0.0.2"), ("*",), ("localhost.example.net",)])
+async def test_f45_a_server_of_another_name_is_refused_by_its_clients(
+    serve_tls: ServeTls, pki: Pki, names: tuple[str, ...], version: ssl.TLSVersion
+) -> None:
+    pki.issue("server", usage=SERVER, names=names)
+    site = await serve_tls()
+    with pytest.raises(ssl.SSLCertVerificationError, match=r"[Hh]ostname mismatch"):
+        await asyncio.to_thread(shake_hands, pki.client("reader", version), site.running.address)
+    await site.running.until(lambda: site.stats.refused.total() == 1)
+    assert site.stats.refused == {"refused_by_client": 1}

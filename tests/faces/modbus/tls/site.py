@@ -10,9 +10,11 @@ import ssl
 import subprocess
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import cache
+from ipaddress import ip_address
 from pathlib import Path
 
 from cryptography import x509
@@ -98,12 +100,12 @@ class Pki:
         issuer: str = "ca",
         names: Sequence[str] = ("localhost",),
     ) -> None:
-        """Make NAME.pem and NAME.key; `days` from and until when, relative to now."""
+        """Make NAME.pem and NAME.key; `days` from and until when, relative to now; `names`: DNS names and addresses."""
         key = ec.generate_private_key(ec.SECP256R1())
         subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
         builder = self._builder(subject, self.certificate(issuer).subject, key.public_key(), days)
-        alternatives = x509.SubjectAlternativeName([x509.DNSName(text) for text in names])
-        for extension in (x509.ExtendedKeyUsage([usage]), alternatives, *extensions):
+        alternatives = [x509.SubjectAlternativeName([_name(text) for text in names])] if names else []
+        for extension in (x509.ExtendedKeyUsage([usage]), *alternatives, *extensions):
             builder = builder.add_extension(extension, critical=False)
         signer = load_pem_private_key((self.folder / f"{issuer}.key").read_bytes(), None)
         assert isinstance(signer, ec.EllipticCurvePrivateKey)
@@ -164,6 +166,12 @@ class Pki:
     def _write_key(self, name: str, key: ec.EllipticCurvePrivateKey) -> None:
         pem = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
         (self.folder / f"{name}.key").write_bytes(pem)
+
+
+def _name(text: str) -> x509.GeneralName:
+    with suppress(ValueError):
+        return x509.IPAddress(ip_address(text))
+    return x509.DNSName(text)
 
 
 def utf8(text: str) -> bytes:

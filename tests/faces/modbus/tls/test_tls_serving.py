@@ -122,17 +122,6 @@ async def test_what_the_handshake_agrees_on(serve_tls: ServeTls, peer: Callable[
     assert "New, TLSv1.2, Cipher is ECDHE-ECDSA-AES" in said
 
 
-async def test_f45_a_client_that_expects_another_server_does_not_talk(
-    serve_tls: ServeTls, peer: Callable[[str], str]
-) -> None:
-    site = await serve_tls()
-    _, said = await s_client(site, peer("openssl"), "-verify_hostname", "another.example.net")
-    assert "hostname mismatch" in said
-    await site.running.until(lambda: site.stats.refused.total() == 1)
-    assert site.stats.refused["refused_by_client"] == 1
-    assert site.world.stats.requests == 0
-
-
 async def test_rsa_keys_do_with_the_mandatory_suite(
     serve_tls: ServeTls, peer: Callable[[str], str], pki_rsa: None
 ) -> None:
