@@ -47,7 +47,7 @@ test-newest: setup ## Run what depends on libraries with the newest versions tha
 	@$(VENV)-newest/bin/python -m pytest -m 'not long' -n $(JOBS) $(LIBRARY_TESTS)
 
 COMMA := ,
-# The rooms where behaviour of pymodbus, pysnmp, pyserial, prometheus-client and aiohttp shows.
+# The rooms where behaviour of pymodbus, pysnmp, pyserial and prometheus-client shows.
 LIBRARY_TESTS := tests/characterisation tests/conformance tests/modbus tests/lines tests/faces
 
 .PHONY: coverage

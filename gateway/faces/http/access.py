@@ -20,10 +20,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from aiohttp import hdrs, web
-from aiohttp.typedefs import Handler, Middleware
-
 from gateway.errors import ListenError
+from gateway.faces.http.request import NO_STORE, Handler, Reply, Request
 from gateway.faces.http.settings import HttpSettings
 
 OPEN_PATHS = frozenset({"/healthz"})
@@ -138,18 +136,15 @@ def _read(path: str) -> bytes:
         raise ListenError(f"{path}: {os.strerror(error.errno) if error.errno else error}") from None
 
 
-def guard(current: Callable[[], Access], refused: Callable[[], None]) -> Middleware:
-    """A middleware that answers 401 to who is not admitted by the `current` credentials; `refused` counts."""
+def guard(handler: Handler, current: Callable[[], Access], refused: Callable[[], None]) -> Handler:
+    """The handler behind a 401 for who is not admitted by the `current` credentials; `refused` counts."""
 
-    @web.middleware
-    async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
+    async def guarded(request: Request) -> Reply | None:
         access = current()
-        if request.path in OPEN_PATHS or access.admits(request.headers.get(hdrs.AUTHORIZATION, "")):
+        if request.path in OPEN_PATHS or access.admits(request.field("authorization")):
             return await handler(request)
         refused()
-        reply = web.Response(status=401, text="credentials are needed\n", headers={"Cache-Control": "no-store"})
-        for challenge in access.challenges:
-            reply.headers.add(hdrs.WWW_AUTHENTICATE, challenge)
-        return reply
+        challenges = tuple(("WWW-Authenticate", challenge) for challenge in access.challenges)
+        return Reply(401, b"credentials are needed\n", fields=(*NO_STORE, *challenges))
 
-    return check
+    return guarded

@@ -16,18 +16,17 @@ import logging
 from collections.abc import AsyncIterator, Mapping
 from contextlib import aclosing
 
-from aiohttp import hdrs, web
-
 from gateway.core.daylog import CONTENT_TYPES, DayLog, LogFormat, Selection, parse_moment
 from gateway.core.site import Site
 from gateway.errors import HistoryError
+from gateway.faces.http.request import Reply, Request
 
 PATH = "/api/v1/log"
 MAX_EXPORTS = 2
-RETRY_AFTER_S = "10"
+RETRY_AFTER = ("Retry-After", "10")
 
 _PARAMETERS = ("device", "since", "until", "format")
-_HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"}
+_FIELDS = (("Cache-Control", "no-store"), ("X-Content-Type-Options", "nosniff"))
 _log = logging.getLogger(__name__)
 
 
@@ -44,7 +43,7 @@ class LogApi:
         self._devices = frozenset(device.name for device in site.devices)
         self._log = log
 
-    async def handle(self, request: web.Request) -> web.StreamResponse:
+    async def handle(self, request: Request) -> Reply | None:
         """The days asked for."""
         if self._log is None:
             return _error(404, "no history is kept: history.enabled is false")
@@ -53,40 +52,36 @@ class LogApi:
         except ValueError as error:
             return _error(400, str(error))
         if self._exports >= MAX_EXPORTS:
-            return _error(503, f"{MAX_EXPORTS} exports are being sent already", {"Retry-After": RETRY_AFTER_S})
+            return _error(503, f"{MAX_EXPORTS} exports are being sent already", RETRY_AFTER)
         self._exports += 1
         try:
             if selection.device is not None and selection.device not in self._devices | await self._log.devices():
                 return _error(404, f"no device is called {selection.device!r}")
             async with aclosing(self._log.export(form, selection)) as pieces:
                 first = await anext(pieces, b"")  # errors before the header are an answer
-                return await self._send(request, form, first, pieces)
+                await self._send(request, form, first, pieces)
+                return None
         except HistoryError as error:
-            return _error(503, str(error), {"Retry-After": RETRY_AFTER_S})
+            return _error(503, str(error), RETRY_AFTER)
         finally:
             self._exports -= 1
 
-    async def _send(
-        self, request: web.Request, form: LogFormat, first: bytes, pieces: AsyncIterator[bytes]
-    ) -> web.StreamResponse:
-        headers = {**_HEADERS, "Content-Type": CONTENT_TYPES[form]}
-        if request.method == hdrs.METH_HEAD:
-            return web.Response(headers=headers)
-        reply = web.StreamResponse(headers=headers)
+    async def _send(self, request: Request, form: LogFormat, first: bytes, pieces: AsyncIterator[bytes]) -> None:
+        by = request.by
+        by.begin((*_FIELDS, ("Content-Type", CONTENT_TYPES[form])))
+        if request.head_only:
+            return
         try:
             async with asyncio.timeout(self._send_timeout_s):
-                await reply.prepare(request)
-                await reply.write(first)
+                await by.write(first)
             async for piece in pieces:
                 async with asyncio.timeout(self._send_timeout_s):
-                    await reply.write(piece)
+                    await by.write(piece)
             async with asyncio.timeout(self._send_timeout_s):
-                await reply.write_eof()
+                await by.end()
         except (TimeoutError, HistoryError) as error:
-            _log.warning('event=log_export_broken_off peer="%s" reason="%s"', request.remote, str(error) or "not taken")
-            if request.transport is not None:
-                request.transport.abort()
-        return reply
+            _log.warning('event=log_export_broken_off peer="%s" reason="%s"', by.peer, str(error) or "not taken")
+            by.abort()
 
 
 def parse_query(query: Mapping[str, str]) -> tuple[LogFormat, Selection]:
@@ -106,5 +101,5 @@ def parse_query(query: Mapping[str, str]) -> tuple[LogFormat, Selection]:
     )
 
 
-def _error(status: int, text: str, headers: Mapping[str, str] | None = None) -> web.Response:
-    return web.json_response({"error": text}, status=status, headers={**_HEADERS, **(headers or {})})
+def _error(status: int, text: str, *fields: tuple[str, str]) -> Reply:
+    return Reply.json({"error": text}, status, (*_FIELDS, *fields))

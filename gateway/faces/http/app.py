@@ -13,8 +13,6 @@ import asyncio
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
-from aiohttp import hdrs, web
-
 from gateway.clock import Clock
 from gateway.core.clients import Client
 from gateway.core.conditions import Conditions
@@ -31,15 +29,17 @@ from gateway.faces.http.exposition import Exposition, compressed
 from gateway.faces.http.listener import HttpListener
 from gateway.faces.http.own import Counts, HttpStats
 from gateway.faces.http.page import index_page
+from gateway.faces.http.request import NO_STORE, Handler, Reply, Request
 from gateway.faces.http.settings import HttpSettings
 from gateway.faces.http.text import accepts_gzip, negotiate
 
-_NO_STORE = {"Cache-Control": "no-store"}
-_PAGE_HEADERS = {
-    **_NO_STORE,
-    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'",
-    "X-Content-Type-Options": "nosniff",
-}
+METHODS = ("GET", "HEAD")
+
+_PAGE_FIELDS = (
+    *NO_STORE,
+    ("Content-Security-Policy", "default-src 'none'; style-src 'unsafe-inline'"),
+    ("X-Content-Type-Options", "nosniff"),
+)
 
 
 class HttpFace:
@@ -77,6 +77,16 @@ class HttpFace:
         self._clients = clients
         self._conditions = conditions
         self._log_api = LogApi(site, log, settings.send_timeout_s)
+        self._pages: Mapping[str, Handler] = {
+            "/": self._index,
+            "/metrics": self._metrics,
+            "/sd": self._discovery,
+            "/healthz": self._healthz,
+            "/readyz": self._readyz,
+            api.PATH: self._log_api.handle,
+            client_list.PATH: self._who_asks,
+            condition_list.PATH: self._what_is_wrong,
+        }
         self.listeners: Sequence[HttpListener] = ()
         self.listeners = self._listeners()
 
@@ -113,87 +123,80 @@ class HttpFace:
         """The listeners of the settings; those that there are already are taken."""
         present = {listener.key: listener for listener in self.listeners}
         wanted = [
-            HttpListener(host, port, self._application, self._settings, self.stats)
+            HttpListener(host, port, self._open, self._settings, clock=self._clock, stats=self.stats)
             for host, port in self._settings.listen
         ]
         return tuple(present.get(listener.key, listener) for listener in wanted)
 
-    def _application(self) -> web.Application:
+    def _open(self) -> Handler:
+        """What answers requests, with the credentials that the files hold now; ListenError when they hold none."""
         self._access = Access.read(self._settings)
-        guarded = guard(lambda: self._access, self._count_refused)
-        application = web.Application(client_max_size=0, middlewares=[guarded])
-        application.router.add_get("/", self._index)
-        application.router.add_get("/metrics", self._metrics)
-        application.router.add_get("/sd", self._discovery)
-        application.router.add_get("/healthz", self._healthz)
-        application.router.add_get("/readyz", self._readyz)
-        application.router.add_get(api.PATH, self._log_api.handle)
-        application.router.add_get(client_list.PATH, self._who_asks)
-        application.router.add_get(condition_list.PATH, self._what_is_wrong)
-        return application
+        return guard(self._answer, lambda: self._access, self._count_refused)
 
-    async def _metrics(self, request: web.Request) -> web.StreamResponse:
+    async def _answer(self, request: Request) -> Reply | None:
+        handler = self._pages.get(request.path)
+        if handler is None:
+            return Reply(404, b"there is no such page\n")
+        if request.head.method not in METHODS:
+            return Reply(405, b"pages are read\n", fields=(*NO_STORE, ("Allow", ", ".join(METHODS))))
+        if request.head.body:
+            return Reply(413, b"a request has no body\n")
+        return await handler(request)
+
+    async def _metrics(self, request: Request) -> Reply | None:
         began = self._clock.monotonic()
-        form = negotiate(",".join(request.headers.getall("Accept", [])))
-        headers = {**_NO_STORE, "Content-Type": form.content_type, "Vary": "Accept, Accept-Encoding"}
+        form = negotiate(request.field("accept"))
+        fields = [*NO_STORE, ("Content-Type", form.content_type), ("Vary", "Accept, Accept-Encoding")]
         pieces = self._exposition.pieces(form)
-        if accepts_gzip(",".join(request.headers.getall("Accept-Encoding", []))):
-            headers["Content-Encoding"] = "gzip"
+        if accepts_gzip(request.field("accept-encoding")):
+            fields.append(("Content-Encoding", "gzip"))
             pieces = compressed(pieces)
-        if request.method == hdrs.METH_HEAD:
-            return web.Response(headers=headers)
-        reply = web.StreamResponse(headers=headers)
+        request.by.begin(fields)
+        if request.head_only:
+            return None
         try:
             async with asyncio.timeout(self._settings.send_timeout_s):
-                await reply.prepare(request)
                 async for piece in pieces:
-                    await reply.write(piece)
-                await reply.write_eof()
+                    await request.by.write(piece)
+                await request.by.end()
         except TimeoutError:  # it asked, and does not read
             self.stats.abandoned += 1
-            if request.transport is not None:
-                request.transport.abort()
-            return reply
+            request.by.abort()
+            return None
         self.stats.scrapes += 1
         self.stats.scrape_s += self._clock.monotonic() - began
-        return reply
+        return None
 
-    async def _discovery(self, request: web.Request) -> web.Response:
-        assert request.transport is not None
-        host, port, *_ = request.transport.get_extra_info("sockname")
-        found = targets(self._site.name, request.host, (host, port), secure=request.secure)
-        return web.json_response(found, headers=_NO_STORE)
+    async def _discovery(self, request: Request) -> Reply:
+        by = request.by
+        return Reply.json(targets(self._site.name, request.head.host, by.local, secure=by.secure))
 
-    async def _who_asks(self, _request: web.Request) -> web.Response:
-        found = client_list.clients_document(self._clients, self._clock.monotonic())
-        return web.json_response(found, headers=_NO_STORE)
+    async def _who_asks(self, _request: Request) -> Reply:
+        return Reply.json(client_list.clients_document(self._clients, self._clock.monotonic()))
 
-    async def _what_is_wrong(self, request: web.Request) -> web.Response:
+    async def _what_is_wrong(self, request: Request) -> Reply:
         try:
             everything = condition_list.wants_all(request.query)
         except ValueError as error:
-            return web.json_response({"error": str(error)}, status=400, headers=_NO_STORE)
+            return Reply.json({"error": str(error)}, 400)
         if self._conditions is None:
-            return web.json_response({"error": "nobody watches conditions"}, status=404, headers=_NO_STORE)
+            return Reply.json({"error": "nobody watches conditions"}, 404)
         now = self._clock.monotonic()
         self._conditions.look(now)
-        found = condition_list.conditions_document(self._conditions, now, everything=everything)
-        return web.json_response(found, headers=_NO_STORE)
+        return Reply.json(condition_list.conditions_document(self._conditions, now, everything=everything))
 
     def _count_refused(self) -> None:
         self.stats.refused += 1
 
-    async def _healthz(self, _request: web.Request) -> web.Response:
-        return web.Response(text="ok\n", headers=_NO_STORE)
+    async def _healthz(self, _request: Request) -> Reply:
+        return Reply(200, b"ok\n")
 
-    async def _readyz(self, _request: web.Request) -> web.Response:
+    async def _readyz(self, _request: Request) -> Reply:
         reasons = self._not_ready()
         if reasons:
-            return web.Response(
-                status=503, text="not ready\n" + "".join(f"{why}\n" for why in reasons), headers=_NO_STORE
-            )
-        return web.Response(text="ready\n", headers=_NO_STORE)
+            return Reply(503, "".join(f"{line}\n" for line in ("not ready", *reasons)).encode())
+        return Reply(200, b"ready\n")
 
-    async def _index(self, _request: web.Request) -> web.Response:
+    async def _index(self, _request: Request) -> Reply:
         page = index_page(self._site, self._clock.monotonic())
-        return web.Response(text=page, content_type="text/html", headers=_PAGE_HEADERS)
+        return Reply(200, page.encode(), "text/html; charset=utf-8", _PAGE_FIELDS)

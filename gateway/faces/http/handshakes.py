@@ -25,7 +25,7 @@ _NO_DESCRIPTORS = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
 class Handshakes:
-    """A listening socket; `protocol` makes what serves a connection, `entered` is told when one is there."""
+    """A listening socket; `protocol` makes what serves a connection."""
 
     def __init__(
         self,
@@ -35,14 +35,12 @@ class Handshakes:
         most: int,
         timeout_s: float,
         protocol: Callable[[], asyncio.BaseProtocol],
-        entered: Callable[[], None],
     ) -> None:
         self.most = most
         self.timeout_s = timeout_s
         self._tls = tls
         self._stats = stats
         self._protocol = protocol
-        self._entered = entered
         self._sock: socket.socket | None = None
         # The one that began first comes first; its socket is here until the loop's transport has it.
         self._pending: dict[asyncio.Task[None], socket.socket | None] = {}
@@ -117,7 +115,6 @@ class Handshakes:
             await asyncio.get_running_loop().connect_accepted_socket(
                 self._protocol, sock, ssl=self._tls, ssl_handshake_timeout=self.timeout_s
             )
-            self._entered()
 
     def _wait(self, sock: socket.socket) -> None:
         loop = asyncio.get_running_loop()

@@ -1,9 +1,7 @@
-"""One address that the HTTP face listens on.
+"""One address that the HTTP face listens on, and its connections (connection.py).
 
-Rules: a connection that sends no whole request header, or no further request, within `idle_timeout_s` is
-closed. At most `max_connections` are kept: when one more comes, the one that has been open longest and has
-nothing left to send makes room, so that idle strangers cannot keep a scraper out. With TLS a connection counts
-from the end of its handshake; as many more may be shaking hands (handshakes.py), each for `idle_timeout_s` at most.
+With TLS a connection counts from the end of its handshake; as many more may be shaking hands (handshakes.py), each for
+`idle_timeout_s` at most.
 """
 
 from __future__ import annotations
@@ -13,42 +11,43 @@ import os
 import ssl
 from collections.abc import Callable
 
-from aiohttp import web
-
+from gateway.clock import Clock
 from gateway.errors import ListenError
 from gateway.faces.http.access import load_certificate, tls_context
+from gateway.faces.http.connection import Connections
 from gateway.faces.http.handshakes import Handshakes
 from gateway.faces.http.own import HttpStats
+from gateway.faces.http.request import Handler
 from gateway.faces.http.settings import HttpSettings
-
-_BURST_S = 0.05  # connections that came in one turn of the loop are counted so long after
 
 
 class HttpListener:
-    """Serves an application on one address; can be started again after a stop or a failed start."""
+    """Answers requests on one address; can be started again after a stop or a failed start."""
 
     def __init__(
         self,
         host: str,
         port: int,
-        application: Callable[[], web.Application],
+        handler: Callable[[], Handler],
         settings: HttpSettings,
+        *,
+        clock: Clock,
         stats: HttpStats,
     ) -> None:
-        """`application` makes the application, which aiohttp wants anew for each start, or raises ListenError."""
+        """`handler` gives, for each start, what answers requests, or raises ListenError."""
         self.label = f"http [{host}]:{port}" if ":" in host else f"http {host}:{port}"
         self._host = host
         self._port = port
-        self._application = application
+        self._handler = handler
         self._settings = settings
+        self._clock = clock
         self._stats = stats
-        self._runner: web.AppRunner | None = None
+        self._connections: Connections | None = None
         self._server: asyncio.Server | None = None
         self._handshakes: Handshakes | None = None  # with TLS, instead of a server
         self._tls: ssl.SSLContext | None = None
         self.key = (host, port, bool(settings.tls_certificate))
         """Two listeners that agree in this are the same."""
-        self._recount: asyncio.TimerHandle | None = None
 
     @property
     def bound(self) -> tuple[str, int] | None:
@@ -65,25 +64,17 @@ class HttpListener:
         if self._server is not None or self._handshakes is not None:
             return
         try:
-            application, tls = self._application(), tls_context(self._settings)
+            handler, tls = self._handler(), tls_context(self._settings)
         except ListenError as error:
             raise ListenError(f"{self.label}: {error}") from None
         self._tls = tls
-        runner = web.AppRunner(
-            application,
-            access_log=None,
-            keepalive_timeout=self._settings.idle_timeout_s,
-            lingering_time=0,  # nobody has anything to send here
-            shutdown_timeout=self._settings.stop_grace_s,
-        )
-        await runner.setup()
-        self._runner = runner
+        self._connections = connections = Connections(self._settings, handler, self._clock, self._stats)
         try:
             if tls is None:
                 loop = asyncio.get_running_loop()
                 self._server = await loop.create_server(self._accept, self._host, self._port)
             else:
-                self._handshakes = self._way_in(tls)
+                self._handshakes = self._way_in(tls, connections)
                 self._handshakes.open(self._host, self._port)
         except OSError as error:
             await self.stop()
@@ -96,6 +87,8 @@ class HttpListener:
     def adjust(self, settings: HttpSettings) -> None:
         """Go on by other settings, with what the certificate files hold now; ListenError when they are of no use."""
         self._settings = settings
+        if self._connections is not None:
+            self._connections.settings = settings
         if self._handshakes is not None:
             self._handshakes.most, self._handshakes.timeout_s = settings.max_connections, settings.idle_timeout_s
         if self._tls is not None:
@@ -104,58 +97,27 @@ class HttpListener:
     async def stop(self) -> None:
         """Stop listening and close every connection; replies under way have `stop_grace_s`."""
         server, self._server = self._server, None
-        runner, self._runner = self._runner, None
-        if self._recount is not None:
-            self._recount.cancel()
-            self._recount = None
+        connections, self._connections = self._connections, None
         if server is not None:
             server.close()
         handshakes, self._handshakes = self._handshakes, None
         if handshakes is not None:
             await handshakes.close()
-        if runner is not None:
-            await runner.cleanup()
+        if connections is not None:
+            await connections.close()
         if server is not None:
             await server.wait_closed()
 
-    def _way_in(self, tls: ssl.SSLContext) -> Handshakes:
-        assert self._runner is not None
-        assert self._runner.server is not None
+    def _way_in(self, tls: ssl.SSLContext, connections: Connections) -> Handshakes:
         return Handshakes(
             tls,
             self._stats,
             most=self._settings.max_connections,
             timeout_s=self._settings.idle_timeout_s,
-            protocol=self._runner.server,
-            entered=lambda: self._make_room(self._settings.max_connections),
+            protocol=connections,
         )
 
     def _accept(self) -> asyncio.Protocol:
-        assert self._runner is not None
-        assert self._runner.server is not None
+        assert self._connections is not None
         self._stats.connections += 1
-        self._make_room(self._settings.max_connections - 1)
-        if self._recount is None:
-            self._recount = asyncio.get_running_loop().call_later(_BURST_S, self._count_again)
-        return self._runner.server()
-
-    def _count_again(self) -> None:
-        self._recount = None
-        self._make_room(self._settings.max_connections)
-
-    def _make_room(self, limit: int) -> None:
-        assert self._runner is not None
-        assert self._runner.server is not None
-        live = [
-            (connection, connection.transport)
-            for connection in self._runner.server.connections  # oldest first
-            if connection.transport is not None
-        ]
-        surplus = len(live) - limit
-        for connection, transport in live:
-            if surplus <= 0:
-                return
-            if transport.get_write_buffer_size() == 0:
-                connection.force_close()
-                self._stats.closed_for_room += 1
-                surplus -= 1
+        return self._connections()

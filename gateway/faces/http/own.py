@@ -41,6 +41,7 @@ class HttpStats:
     scrape_s: float = 0.0
     abandoned: int = 0  # scrapes whose reply was not taken in time
     refused: int = 0  # requests without the right name, password or token
+    failed: int = 0  # requests that met a mistake of ours
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,6 +176,7 @@ HTTP_RULES: tuple[Rule[HttpStats], ...] = (
         lambda stats: stats.closed_for_room,
     ),
     one(gateway_counter("http_refused", "HTTP requests without the right credentials."), lambda stats: stats.refused),
+    one(gateway_counter("http_failed", "HTTP requests that met a mistake of the gateway."), lambda stats: stats.failed),
     one(
         gateway_counter("scrapes_abandoned", "Scrapes whose reply was not taken in time."),
         lambda stats: stats.abandoned,

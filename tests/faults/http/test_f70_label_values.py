@@ -35,7 +35,7 @@ def configured(tmp_path: Path) -> Gateway:
 
 def scrape(gateway: Gateway, form: Format) -> bytes:
     [face] = [listener for listener in gateway.listeners if listener.label.startswith("http ")]
-    exposition = face._application.__self__._exposition  # type: ignore[attr-defined]  # the face behind its listener
+    exposition = face._handler.__self__._exposition  # type: ignore[attr-defined]  # the face behind its listener
 
     async def whole() -> bytes:
         return b"".join([piece async for piece in exposition.pieces(form)])

@@ -1,0 +1,194 @@
+"""Connections byte by byte: what comes back, in which order, and when they end."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import struct
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import pytest
+
+from gateway.faces.http.connection import BUSY_FACTOR
+from gateway.faces.http.request import Reply, Request
+from gateway.faces.http.wire import HEAD_BYTES
+
+from .conftest import Gateway
+from .test_listener import still_open, strangers
+
+MakeGateway = Callable[..., Gateway]
+
+
+def get(path: str, *fields: str, version: str = "1.1", method: str = "GET") -> bytes:
+    return "\r\n".join((f"{method} {path} HTTP/{version}", "Host: gateway", *fields, "", "")).encode()
+
+
+async def talk(gateway: Gateway, *sends: bytes, half_closed: bool = False) -> bytes:
+    """Everything that comes back until the gateway closes."""
+    bound = gateway.face.listeners[0].bound
+    assert bound is not None
+    reader, writer = await asyncio.open_connection(*bound)
+    try:
+        for data in sends:
+            writer.write(data)
+            await writer.drain()
+        if half_closed:
+            writer.write_eof()
+        async with asyncio.timeout(10):
+            return await reader.read()
+    finally:
+        writer.close()
+
+
+async def test_a_reply_has_a_date_a_length_and_is_not_kept(gateway: Gateway) -> None:
+    head, _, body = (await talk(gateway, get("/healthz", "Connection: close"))).partition(b"\r\n\r\n")
+    lines = head.decode().split("\r\n")
+    assert lines[0] == "HTTP/1.1 200 OK"
+    assert set(lines[1:]) == {
+        "Date: Tue, 14 Nov 2023 22:13:20 GMT",
+        "Content-Type: text/plain; charset=utf-8",
+        "Content-Length: 3",
+        "Cache-Control: no-store",
+        "Connection: close",
+    }
+    assert body == b"ok\n"
+
+
+async def test_requests_in_one_go_are_answered_in_their_order(gateway: Gateway) -> None:
+    paths = ["/healthz", "/nothing", "/metrics", "/readyz"] * 5
+    data = b"".join(get(path) for path in paths) + get("/healthz", "Connection: close") + get("/readyz")
+    replies = (await talk(gateway, data)).split(b"HTTP/1.1 ")[1:]
+    assert [reply[:3] for reply in replies] == [b"200", b"404", b"200", b"200"] * 5 + [b"200"]
+    assert all(b"morningstar_up" in reply for reply in replies[2::4])
+    assert gateway.face.stats.connections == 1
+
+
+async def test_more_requests_than_are_kept_wait_in_the_socket(gateway: Gateway) -> None:
+    count = 4 * HEAD_BYTES // len(get("/healthz"))
+    replies = await talk(gateway, get("/healthz") * count, get("/healthz", "Connection: close"))
+    assert replies.count(b"200 OK") == count + 1
+
+
+async def test_http_1_0_has_no_chunks_and_ends_by_closing(gateway: Gateway) -> None:
+    reply = await talk(gateway, get("/metrics", version="1.0"))
+    head, _, body = reply.partition(b"\r\n\r\n")
+    assert b"chunked" not in head
+    assert b"Connection: close" in head
+    assert body.startswith(b"# HELP")
+    assert body.endswith(b"\n")
+
+
+@pytest.mark.parametrize("path", ["/metrics", "/api/v1/clients"])
+async def test_who_has_said_all_still_gets_the_reply(gateway: Gateway, path: str) -> None:
+    reply = await talk(gateway, get(path), half_closed=True)
+    assert reply.startswith(b"HTTP/1.1 200")
+    assert reply.endswith((b"0\r\n\r\n", b"}"))
+
+
+@pytest.mark.parametrize("path", ["/metrics", "/", "/nothing"])
+async def test_head_has_no_body_and_the_connection_goes_on(gateway: Gateway, path: str) -> None:
+    reply = await talk(gateway, get(path, method="HEAD"), get("/healthz", "Connection: close"))
+    first, _, second = reply.partition(b"\r\n\r\n")
+    assert b"HTTP/1.1" in first
+    assert second.startswith(b"HTTP/1.1 200 OK")
+
+
+@pytest.mark.parametrize(
+    ("method", "field", "status"),
+    [("POST", "Content-Length: 40", b"405"), ("GET", "Transfer-Encoding: chunked", b"413")],
+)
+async def test_a_body_is_never_taken_for_a_request(gateway: Gateway, method: str, field: str, status: bytes) -> None:
+    smuggled = get("/metrics")
+    reply = await talk(gateway, get("/metrics", field, method=method) + smuggled)
+    assert reply.count(b"HTTP/1.1 ") == 1
+    assert reply[9:12] == status
+    assert gateway.face.stats.scrapes == 0
+
+
+async def test_a_handler_that_fails_costs_its_own_connection(
+    gateway: Gateway, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def broken(_request: Request) -> Reply:
+        raise ZeroDivisionError
+
+    monkeypatch.setitem(gateway.face._pages, "/broken", broken)
+    with caplog.at_level(logging.ERROR):
+        reply = await talk(gateway, get("/broken") + get("/healthz"))
+    assert reply.startswith(b"HTTP/1.1 500 ")
+    assert reply.count(b"HTTP/1.1") == 1
+    assert b"ZeroDivision" not in reply
+    assert 'event=http_request_failed path="/broken"' in caplog.text
+    assert gateway.face.stats.failed == 1
+    assert (await talk(gateway, get("/healthz", "Connection: close"))).endswith(b"ok\n")
+
+
+@asynccontextmanager
+async def waiting(gateway: Gateway, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[asyncio.Event]:
+    """A page that answers when it is let, and sees its own end."""
+    gate = asyncio.Event()
+
+    async def wait(_request: Request) -> Reply:
+        await gate.wait()
+        return Reply(200, b"done\n")
+
+    monkeypatch.setitem(gateway.face._pages, "/wait", wait)
+    yield gate
+    gate.set()
+
+
+async def test_a_request_under_way_makes_no_room_but_not_for_ever(
+    make_gateway: MakeGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    most = 2
+    async with (
+        make_gateway(max_connections=most).running() as gateway,
+        waiting(gateway, monkeypatch) as gate,
+        strangers(gateway, BUSY_FACTOR * most + 3, get("/wait", "Connection: close")) as opened,
+    ):
+        async with asyncio.timeout(10):
+            while gateway.face.stats.closed_for_room < 3:  # noqa: ASYNC110  a counter sets no event
+                await asyncio.sleep(0.001)
+        gate.set()
+        replies = await asyncio.gather(*(reader.read() for reader, _ in opened), return_exceptions=True)
+    good = [reply for reply in replies if isinstance(reply, bytes) and reply.endswith(b"done\n")]
+    assert len(good) == BUSY_FACTOR * most
+
+
+async def test_stopping_lets_a_reply_under_way_go_out(
+    make_gateway: MakeGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with make_gateway(stop_grace_s=60.0).running() as gateway, waiting(gateway, monkeypatch) as gate:
+        asking = asyncio.create_task(talk(gateway, get("/wait")))
+        connections = gateway.face.listeners[0]._connections
+        assert connections is not None
+        async with asyncio.timeout(10):
+            while not any(each.busy for each in connections._live):  # noqa: ASYNC110  as above
+                await asyncio.sleep(0.001)
+        stopping = asyncio.create_task(gateway.face.listeners[0].stop())
+        await asyncio.sleep(0)
+        gate.set()
+        await stopping
+        assert (await asking).endswith(b"done\n")
+
+
+async def test_a_client_that_breaks_off_ends_its_request(gateway: Gateway, monkeypatch: pytest.MonkeyPatch) -> None:
+    ended = asyncio.Event()
+
+    async def wait(_request: Request) -> Reply:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            ended.set()
+        raise AssertionError
+
+    monkeypatch.setitem(gateway.face._pages, "/wait", wait)
+    async with strangers(gateway, 1, get("/wait")) as [streams]:
+        assert await still_open(streams)
+        reset = struct.pack("ii", 1, 0)  # an end without a farewell; with one it may only have said all
+        streams[1].get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, reset)
+        streams[1].transport.abort()
+        async with asyncio.timeout(10):
+            await ended.wait()
+    assert gateway.face.stats.failed == 0
