@@ -31,8 +31,8 @@ demo: $(VENV)/.runtime ## Run four simulated controllers, the gateway and its th
 	@exec $(BIN)/python -m gateway demo
 
 .PHONY: test
-test: setup lint ## Set everything up, lint, and run the tests with coverage.
-	@$(BIN)/python -m pytest -m 'not long' -n $(JOBS) --cov --cov-report=
+test: setup lint ## Set everything up, lint, and run the tests.
+	@$(BIN)/python -m pytest -m 'not long' -n $(JOBS) --dist=worksteal
 
 .PHONY: test-long
 test-long: setup ## Run the long tiers: whole days, chaos, churn, restarts, installation; SOAK_S=3600 makes chaos an hour.
@@ -51,8 +51,8 @@ COMMA := ,
 LIBRARY_TESTS := tests/characterisation tests/conformance tests/modbus tests/lines tests/faces
 
 .PHONY: coverage
-coverage: ## Show which lines the last `make test` did not reach.
-	@$(BIN)/python -m coverage report
+coverage: setup ## Run the tests of `make test` with branch coverage, and show which lines they do not reach.
+	@$(BIN)/python -m pytest -m 'not long' -n $(JOBS) --dist=worksteal --cov --cov-report=term
 
 .PHONY: lint
 lint: $(VENV)/.dev ## Check style, types, the layers, and that derived files are current.
