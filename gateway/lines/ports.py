@@ -32,6 +32,9 @@ KEEPALIVE = {
 }
 """Options of a connection to a terminal server: seconds, but the user time-out is in milliseconds."""
 
+PSEUDO_TERMINALS = range(136, 144)
+"""Their major device numbers on Linux."""
+
 
 def is_network(port: str) -> bool:
     """Whether the port is a URL and not a device path."""
@@ -123,19 +126,25 @@ def _reason(path: str, error: Exception) -> str:
 def holder_of(path: str, *, but: int = 0) -> str:
     """Name and process id of a program that has the device open, "" when none can be seen; `but` is not named."""
     try:
-        wanted = Path(path).stat().st_rdev
+        wanted = _identity(Path(path))
     except OSError:
         return ""
     for fd in Path("/proc").glob("[0-9]*/fd/*"):
         pid = int(fd.parts[2])
         try:
-            if pid == but or fd.stat().st_rdev != wanted:
+            if pid == but or _identity(fd) != wanted:
                 continue
             name = (fd.parent.parent / "comm").read_text(encoding="utf-8").strip()
         except OSError:
             continue
         return "this program" if pid == os.getpid() else f"{name} (process {pid})"
     return ""
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    """What one device has and no other: its number; those of pseudo terminals are of their mount, one a container."""
+    found = path.stat()
+    return found.st_rdev, found.st_dev if os.major(found.st_rdev) in PSEUDO_TERMINALS else 0
 
 
 def _name_intruder(settings: LineSettings) -> None:

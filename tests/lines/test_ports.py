@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import termios
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,45 @@ def test_the_holder_of_a_port_is_named_by_program_and_process() -> None:  # F19
         with pytest.raises(PortError, match=rf"{path}: in use by .*\(process {holder.pid}\)"):
             open_port(settings(path))
         holder.kill()
+    os.close(master)
+
+
+CONTAINER = """
+import fcntl, os, struct, subprocess, sys
+UNLOCK = 0x40045431  # TIOCSPTLCK
+folder, name = sys.argv[1:]
+os.mkdir(folder)
+if subprocess.run(["mount", "-t", "devpts", "-o", "newinstance,ptmxmode=666", "none", folder]).returncode:
+    sys.exit("not permitted")
+while not os.path.exists(f"{folder}/{name}"):
+    master = os.open(f"{folder}/ptmx", os.O_RDWR | os.O_NOCTTY)
+fcntl.ioctl(master, UNLOCK, struct.pack("i", 0))
+os.open(f"{folder}/{name}", os.O_RDWR | os.O_NOCTTY)
+print("held", flush=True)
+sys.stdin.read()
+"""
+"""A program in a container: its terminals are numbered from 0 again."""
+
+
+@pytest.mark.peer
+def test_the_terminal_of_that_number_in_a_container_is_another_one(peer: Callable[[str], str], tmp_path: Path) -> None:
+    master, slave = pty.openpty()
+    path = os.ttyname(slave)
+    command = [peer("unshare"), "--user", "--map-root-user", "--mount", sys.executable, "-c", CONTAINER]
+    with subprocess.Popen(
+        [*command, str(tmp_path / "pts"), Path(path).name],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    ) as holder:
+        assert holder.stdout is not None
+        assert holder.stderr is not None
+        if holder.stdout.readline() != b"held\n":
+            pytest.skip(f"namespaces are not permitted here: {holder.stderr.read().decode().strip()}")
+        assert holder_of(path) == "this program"
+        assert holder_of(path, but=os.getpid()) == ""
+        holder.kill()
+    os.close(slave)
     os.close(master)
 
 
