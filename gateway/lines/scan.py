@@ -2,8 +2,8 @@
 
 Rule 1: only reads are ever sent: one register to find who is there, Read Device Identification and the serial number
         to tell what it is. A device without identification is found all the same.
-Rule 2: an address is silent when no byte came within the time-out; a reply that came later shows itself at the next
-        address, and the one before is asked again with more patience.
+Rule 2: an address is silent when no byte came within the time-out, and none is there that was not looked at; a reply
+        that came later shows itself at the next address, and the one before is asked again with more patience.
 Rule 3: a damaged answer is asked for again. One that stays damaged is reported as such: two controllers with one
         address sound like that. Noise alone is no answer.
 Rule 4: the scan can be stopped between any two bytes; what was found until then counts.
@@ -159,8 +159,11 @@ class Scanner:
         heard = False
         event: Replied | Failed | None = None
         while event is None:
+            looked_at = time.monotonic()
             heard, event = self._receive(heard=heard)
             now = time.monotonic()
+            if self._is_waiting():  # it came while a busy machine did not let us look: no time has passed without it
+                now = looked_at
             if event is None and not heard and now >= silent_at:
                 self._rtu.reset(now)
                 return None
@@ -173,6 +176,13 @@ class Scanner:
         try:
             self._port.write(frame)
         except (OSError, serial.SerialException) as error:
+            raise PortError(str(error)) from error
+
+    def _is_waiting(self) -> bool:
+        """Whether bytes are there that were not looked at."""
+        try:
+            return bool(self._port.in_waiting)
+        except (OSError, TypeError, AttributeError, serial.SerialException) as error:
             raise PortError(str(error)) from error
 
     def _receive(self, *, heard: bool = False) -> tuple[bool, Replied | Failed | None]:

@@ -110,7 +110,7 @@ async def test_a_line_is_found_as_it_is_and_nothing_is_written(tmp_path: Path) -
         OracleController(MAP, device=5, address=9),  # the second controller with this address
     )
     async with wired(tmp_path, wire, *stations) as port:
-        arguments = ("--baudrates", str(FAST), "--addresses", "1-4,5-9", "--timeout-s", "0.05")
+        arguments = ("--baudrates", str(FAST), "--addresses", "1-4,5-9", "--timeout-s", "0.2")
         status, toml, said = await scanned(port.path.removeprefix("/"), *arguments, cwd="/")
     assert status == 0
     assert "5 found." in said
@@ -142,7 +142,7 @@ async def test_a_line_is_found_as_it_is_and_nothing_is_written(tmp_path: Path) -
 async def test_the_speed_is_found_too(tmp_path: Path) -> None:
     wire = Wire(19200)
     async with wired(tmp_path, wire, OracleController(MAP, address=2)) as port:
-        arguments = ("--baudrates", "9600,19200", "--addresses", "1-3", "--timeout-s", "0.05")
+        arguments = ("--baudrates", "9600,19200", "--addresses", "1-3", "--timeout-s", "0.2")
         status, toml, _ = await scanned(port.path, *arguments)
     assert status == 0
     config = parse_config(f'site = "here"\n{toml}')
@@ -150,9 +150,9 @@ async def test_the_speed_is_found_too(tmp_path: Path) -> None:
 
 
 async def test_a_late_answer_is_asked_for_again_with_patience(tmp_path: Path) -> None:
-    slow = OracleController(MAP, address=2, turnaround_s=0.15)
+    slow = OracleController(MAP, address=2, turnaround_s=0.4)
     async with wired(tmp_path, Wire(FAST), slow) as port:
-        arguments = ("--baudrates", str(FAST), "--addresses", "1-4", "--timeout-s", "0.1")
+        arguments = ("--baudrates", str(FAST), "--addresses", "1-3", "--timeout-s", "0.3")
         status, toml, _ = await scanned(port.path, *arguments)
     assert (status, addresses(toml)) == (0, [2])
     assert tomllib.loads(toml)["line"][0]["device"][0]["model"] == "prostar-mppt"
@@ -160,13 +160,13 @@ async def test_a_late_answer_is_asked_for_again_with_patience(tmp_path: Path) ->
 
 async def test_noise_is_nobody_and_nobody_is_status_1(tmp_path: Path) -> None:
     async with wired(tmp_path, Wire(FAST, noise=b"\x00\xff\x01\x03\x55" * 3)) as port:
-        arguments = ("--baudrates", str(FAST), "--addresses", "1-4", "--timeout-s", "0.05")
+        arguments = ("--baudrates", str(FAST), "--addresses", "1-4", "--timeout-s", "0.2")
         assert (await scanned(port.path, *arguments))[:2] == (1, "")
 
 
 async def test_a_controller_is_found_through_noise(tmp_path: Path) -> None:
     async with wired(tmp_path, Wire(FAST, noise=b"\x00\xff\x55"), OracleController(MAP, address=2)) as port:
-        arguments = ("--baudrates", str(FAST), "--addresses", "1-3", "--timeout-s", "0.05")
+        arguments = ("--baudrates", str(FAST), "--addresses", "1-3", "--timeout-s", "0.2")
         status, toml, _ = await scanned(port.path, *arguments)
     assert (status, addresses(toml)) == (0, [2])
 
@@ -174,12 +174,12 @@ async def test_a_controller_is_found_through_noise(tmp_path: Path) -> None:
 async def test_ctrl_c_prints_what_was_found_until_then(tmp_path: Path) -> None:
     wire = Wire(FAST)
     async with wired(tmp_path, wire, OracleController(MAP, address=2), OracleController(MAP, address=200)) as port:
-        process = await scanning(port.path, "--baudrates", str(FAST), "--timeout-s", "0.05")
+        process = await scanning(port.path, "--baudrates", str(FAST), "--timeout-s", "0.2")
         async with asyncio.timeout(30):
             while not any(request[0] == 5 for request in wire.requests):  # noqa: ASYNC110  # the wire has no event
                 await asyncio.sleep(0.01)
         process.send_signal(signal.SIGINT)
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(30):
             said, complained = await process.communicate()
     assert process.returncode == 130
     assert addresses(said.decode()) == [2]
@@ -203,12 +203,12 @@ async def test_a_port_that_goes_away_ends_the_scan_with_what_was_found(tmp_path:
     wire = Wire(FAST)
     async with wired(tmp_path, wire, OracleController(MAP, address=2)) as port:
         path = port.path
-        process = await scanning(path, "--baudrates", str(FAST), "--timeout-s", "0.05")
+        process = await scanning(path, "--baudrates", str(FAST), "--timeout-s", "0.2")
         async with asyncio.timeout(30):
             while not any(request[0] == 4 for request in wire.requests):  # noqa: ASYNC110  # as above
                 await asyncio.sleep(0.01)
         port.unplug()
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(30):
             said, complained = await process.communicate()
     assert process.returncode == 1
     assert addresses(said.decode()) == [2]
