@@ -47,7 +47,7 @@ SIMULATION = ("--speed", "120", "--start-hour", "8")
 
 REFRESH_S = 1.0
 PLAIN_REFRESH_S = 5.0
-START_S = 20.0
+START_S = 60.0
 
 
 @dataclass(frozen=True, slots=True)
