@@ -58,7 +58,7 @@ async def serve(requests: list[Adu]) -> list[Adu]:
     connection.connection_made(transport)
     splitter = MbapSplitter()
     replies: list[Adu] = []
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(30):
         for request in requests:
             transport.wrote.clear()
             connection.data_received(encode(*request))

@@ -71,7 +71,7 @@ class Running:
         self._loop.close()
 
     async def _ready(self) -> None:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             while self._gateway.not_ready():  # noqa: ASYNC110 - readiness is polled by everybody
                 await asyncio.sleep(0.01)
 

@@ -55,7 +55,7 @@ class Program:
             self._lines.put(line.decode().rstrip())
         self._lines.put(None)
 
-    def wait_for(self, pattern: str, timeout_s: float = 15.0) -> str:
+    def wait_for(self, pattern: str, timeout_s: float = 60.0) -> str:
         """The next line of its log that matches; fails with the log when none comes in time."""
         deadline = time.monotonic() + timeout_s
         while True:
@@ -80,7 +80,7 @@ class Program:
                     self.seen.append(line)
         return "\n".join(self.seen)
 
-    def end(self, number: signal.Signals = signal.SIGTERM, timeout_s: float = 10.0) -> int:
+    def end(self, number: signal.Signals = signal.SIGTERM, timeout_s: float = 30.0) -> int:
         """Send a signal and wait; gives the exit status."""
         if self.process.poll() is None:
             self.process.send_signal(number)
@@ -96,7 +96,7 @@ class Program:
             self.process.stderr.close()
 
 
-def wait_until(condition: Callable[[], object], what: str, timeout_s: float = 15.0) -> None:
+def wait_until(condition: Callable[[], object], what: str, timeout_s: float = 60.0) -> None:
     """Ask until it is true; fails naming what was waited for."""
     deadline = time.monotonic() + timeout_s
     while not condition():
@@ -119,7 +119,7 @@ class Running:
     def get(self, path: str) -> tuple[int, str]:
         """Status and text of an HTTP reply; 0 when there is none."""
         try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{self.http}{path}", timeout=5) as reply:
+            with urllib.request.urlopen(f"http://127.0.0.1:{self.http}{path}", timeout=30) as reply:
                 return reply.status, reply.read().decode()
         except urllib.error.HTTPError as error:
             with error:
@@ -132,7 +132,7 @@ class Running:
         found = re.findall(r'^morningstar_up\{device="([^"]*)".* ([01])\.0$', self.get("/metrics")[1], re.MULTILINE)
         return {name: float(value) for name, value in found}
 
-    def wait_online(self, *devices: str, timeout_s: float = 20.0) -> None:
+    def wait_online(self, *devices: str, timeout_s: float = 60.0) -> None:
         """Wait until these devices (all when none is named) are online."""
 
         def online() -> bool:

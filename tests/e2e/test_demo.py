@@ -21,6 +21,9 @@ import pytest
 from tests.e2e.programs import GATEWAY, REPOSITORY, alive, children_of, environment, wait_until
 
 COMMAND = re.compile(r"^(?:mbpoll|snmp\w+|curl) .*\S", re.MULTILINE)
+ENDS_S = 10.0
+"""More than twenty times what it takes where nothing else runs. What bounds it is in tests/cli/test_children.py."""
+
 ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
@@ -54,7 +57,7 @@ class Terminal:
         """Everything that was shown, without colours and movements."""
         return ESCAPE.sub("", self.raw).replace("\r\n", "\n").replace("\r", "\n")
 
-    def wait_for(self, pattern: str, timeout_s: float = 20.0) -> None:
+    def wait_for(self, pattern: str, timeout_s: float = 60.0) -> None:
         """Wait until something like it was shown."""
 
         def shown() -> bool:
@@ -71,11 +74,11 @@ class Terminal:
 
     def ended(self, began: float) -> float:
         """Read to the end; seconds since `began`."""
-        while self.read() and time.monotonic() - began < 10:
+        while self.read() and time.monotonic() - began < ENDS_S:
             if self.process.poll() is not None:
                 self.read(0)
                 break
-        self.process.wait(timeout=10)
+        self.process.wait(timeout=ENDS_S)
         return time.monotonic() - began
 
     def close(self) -> None:
@@ -137,7 +140,7 @@ def test_the_printed_commands_work_and_ctrl_c_leaves_nothing(
         assert re.search(expected, done.stdout), f"{command}\n{done.stdout}"
     children = children_of(demo.process.pid)
     assert len(children) == 2
-    assert demo.interrupt() < 2.0
+    assert demo.interrupt() < ENDS_S
     assert demo.process.returncode == 0
     assert alive(children) == []
     assert list(tmp_path.iterdir()) == []
@@ -152,7 +155,7 @@ def test_a_wide_terminal_shows_what_each_command_does(terminal: OpenTerminal) ->
     assert row is not None, demo.text()
     assert max(len(line) for line in demo.text().splitlines()) <= 120
     demo.process.terminate()
-    assert demo.ended(time.monotonic()) < 2.0
+    assert demo.ended(time.monotonic()) < ENDS_S
     assert demo.process.returncode == 0
 
 
@@ -168,10 +171,8 @@ def test_without_a_terminal_there_are_plain_lines(ports: list[str]) -> None:
             if line.startswith("shelter-b up"):
                 break
     finally:
-        began = time.monotonic()
         process.send_signal(signal.SIGTERM)
-        _, said = process.communicate(timeout=10)
-    assert time.monotonic() - began < 2.0
+        _, said = process.communicate(timeout=ENDS_S)
     assert process.returncode == 0
     assert said == ""
     assert sum(COMMAND.match(line) is not None for line in shown) == 6
@@ -223,7 +224,7 @@ def test_a_storm_of_signals_ends_it_like_one(terminal: OpenTerminal) -> None:
     began = time.monotonic()
     for number in (signal.SIGHUP, signal.SIGTERM, signal.SIGINT) * 20:
         demo.process.send_signal(number)
-    assert demo.ended(began) < 2.0
+    assert demo.ended(began) < ENDS_S
     assert demo.process.returncode == 0
     assert alive(children) == []
     assert "Traceback" not in demo.text()
@@ -235,7 +236,7 @@ def test_a_terminal_that_is_closed_ends_it(terminal: OpenTerminal) -> None:
     children = children_of(demo.process.pid)
     os.close(demo.master)
     demo.master = os.open(os.devnull, os.O_RDONLY)  # for the fixture to close
-    assert demo.process.wait(timeout=5) == 0
+    assert demo.process.wait(timeout=ENDS_S) == 0
     assert alive(children) == []
 
 
@@ -243,7 +244,7 @@ def test_ctrl_c_while_it_starts_ends_it(terminal: OpenTerminal) -> None:
     demo = terminal()
     demo.wait_for("Starting the gateway")
     children = children_of(demo.process.pid)
-    assert demo.interrupt() < 2.0
+    assert demo.interrupt() < ENDS_S
     assert demo.process.returncode == 0
     assert alive(children) == []
     assert "Traceback" not in demo.text()
@@ -255,7 +256,7 @@ def test_a_killed_demo_leaves_no_orphans(terminal: OpenTerminal) -> None:
     children = children_of(demo.process.pid)
     demo.process.kill()
     demo.process.wait()
-    wait_until(lambda: not alive(children), "the end of simulator and gateway", timeout_s=5.0)
+    wait_until(lambda: not alive(children), "the end of simulator and gateway", timeout_s=ENDS_S)
 
 
 def test_a_gateway_that_ends_is_told_with_its_log(terminal: OpenTerminal) -> None:

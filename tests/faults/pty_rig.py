@@ -56,7 +56,7 @@ class PtyRig:
         """Pull the adapter when the simulator is done with the bytes at hand."""
         asyncio.get_running_loop().call_soon(self.pty.unplug)
 
-    async def online(self, limit_s: float = 20.0) -> None:
+    async def online(self, limit_s: float = 60.0) -> None:
         """Wait until every device is online and all its blocks are read, so that the line is quiet."""
         blocks = len(poll_plan(oracle_map()))
         await self.until(
@@ -67,7 +67,7 @@ class PtyRig:
             limit_s=limit_s,
         )
 
-    async def until(self, condition: Callable[[], bool], limit_s: float = 20.0) -> None:
+    async def until(self, condition: Callable[[], bool], limit_s: float = 60.0) -> None:
         """Wait for a state that only the line brings about."""
         try:
             async with asyncio.timeout(limit_s):
@@ -78,7 +78,7 @@ class PtyRig:
                 error.add_note(self.medium.report())
             raise
 
-    async def ask(self, unit: int, pdu: bytes, limit_s: float = 20.0) -> Outcome:
+    async def ask(self, unit: int, pdu: bytes, limit_s: float = 60.0) -> Outcome:
         """Read as a client does; what comes is judged."""
         asked_at = self.clock.monotonic()
         done: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
@@ -88,7 +88,7 @@ class PtyRig:
         self.judge(unit, pdu, outcome, asked_at=asked_at)
         return outcome
 
-    async def write(self, unit: int, pdu: bytes, limit_s: float = 20.0) -> Outcome:
+    async def write(self, unit: int, pdu: bytes, limit_s: float = 60.0) -> Outcome:
         """Write as a client does."""
         done: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
         self.line.write(self.devices[unit], pdu, done.set_result)

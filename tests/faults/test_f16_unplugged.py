@@ -14,6 +14,7 @@ from gateway.errors import LineDown
 from gateway.simulator.chaos import Chaos, Fault
 from tests.faults.pty_rig import running
 from tests.faults.rig import MakeRig, read
+from tests.machine import Stopwatch
 
 
 def open_files() -> list[str]:
@@ -65,9 +66,9 @@ async def test_over_a_pty_within_a_second_without_a_busy_loop(tmp_path: Path, ca
         chaos.on_port_fault = line.unplug_soon
         chaos.force(Fault.UNPLUG, Fault.DROP)
         waiting = [asyncio.ensure_future(line.ask(0, read(0x8000 + n, 100))) for n in (0, 200, 400)]
-        begun = time.monotonic()
+        watch = Stopwatch()
         outcomes = await asyncio.gather(*waiting)
-        assert time.monotonic() - begun < 1.0
+        assert watch.s < 1.0
         assert [type(outcome) for outcome in outcomes] == [LineDown] * 3
         assert line.line.status(line.clock.monotonic()).state is LineState.DOWN
         assert line.devices[0].snapshot.state is DeviceState.STALE

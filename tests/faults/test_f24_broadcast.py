@@ -36,7 +36,7 @@ async def test_unit_0_is_0a_and_nothing_reaches_the_line(tmp_path: Path) -> None
             for request in REQUESTS:
                 pdu = bytes.fromhex(request)
                 writer.write(mbap.encode(7, 0, pdu))
-                async with asyncio.timeout(5):
+                async with asyncio.timeout(30):
                     assert await reader.readexactly(9) == mbap.encode(7, 0, bytes((pdu[0] | 0x80, 0x0A)))
             writer.close()
             await writer.wait_closed()

@@ -40,7 +40,7 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> type[SlowStore]:
 async def test_one_that_is_opened_when_nobody_waits_any_more_is_closed(slow: type[SlowStore], tmp_path: Path) -> None:
     store = AsyncStore(tmp_path, SystemClock(), HistoryStats())
     opening = asyncio.create_task(store.ready())
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(30):
         while not slow.made:  # noqa: ASYNC110 - it is another thread that opens it
             await asyncio.sleep(0.001)
     opening.cancel()

@@ -12,6 +12,7 @@ from gateway.core.settings import LineSettings
 from gateway.core.site import Device, Outcome
 from gateway.lines.serial import SerialLine
 from gateway.modbus.pdu import Function, ReadRequest
+from tests.machine import Stopwatch
 
 
 @contextlib.asynccontextmanager
@@ -30,7 +31,7 @@ def make_line(port: Path | str, device: Device, **settings: object) -> SerialLin
     return SerialLine(line_settings, [device], SystemClock())
 
 
-async def until(condition: Callable[[], bool], limit_s: float = 10.0) -> None:
+async def until(condition: Callable[[], bool], limit_s: float = 30.0) -> None:
     """Wait for a state that only the outside world brings about."""
     async with asyncio.timeout(limit_s):
         while not condition():  # noqa: ASYNC110  # the snapshot is replaced without an event
@@ -40,23 +41,22 @@ async def until(condition: Callable[[], bool], limit_s: float = 10.0) -> None:
 async def ask(line: SerialLine, device: Device, address: int, count: int = 1) -> Outcome:
     done: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
     line.read(device, ReadRequest(Function.READ_HOLDING_REGISTERS, address, count).encode(), done.set_result)
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(30):
         return await done
 
 
 class LoopLag:
-    """The longest time in which the loop did nothing else, in seconds."""
+    """The longest time in which the loop did nothing else, in seconds; time that other processes took is left out."""
 
     def __init__(self) -> None:
         self.worst_s = 0.0
 
     async def measure(self) -> None:
         """Run beside what is measured until cancelled."""
-        loop = asyncio.get_running_loop()
         while True:
-            asked = loop.time()
+            watch = Stopwatch()
             await asyncio.sleep(0.005)
-            self.worst_s = max(self.worst_s, loop.time() - asked - 0.005)
+            self.worst_s = max(self.worst_s, watch.s - 0.005)
 
 
 @contextlib.asynccontextmanager

@@ -10,7 +10,6 @@ import signal
 import socket
 import subprocess
 import threading
-import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 
@@ -27,6 +26,7 @@ from gateway.simulator.line import SimulatedLine
 from gateway.simulator.oracle import OracleController
 from gateway.simulator.pty import PtyLine
 from tests.lines.rig import ask, lag_meter, make_line, running, until
+from tests.machine import Stopwatch
 
 BAUDRATE = 115200
 MOST_LAG_S = 0.25
@@ -98,11 +98,11 @@ async def test_a_line_behind_a_terminal_server_is_lost_and_comes_back(bridge: Br
         words = b"".join(word.to_bytes(2, "big") for word in held)
         assert await ask(line, device, 8, 3) == b"\x03\x06" + words
         bridge.end()
-        await until(lambda: line.status(0.0).state is LineState.DOWN, limit_s=1.0)
+        await until(lambda: line.status(0.0).state is LineState.DOWN)
         assert isinstance(await ask(line, device, 8), LineDown)
         bridge.start()
-        await until(lambda: line.status(0.0).state is LineState.OPEN, limit_s=7.0)
-        await until(lambda: device.snapshot.state is DeviceState.ONLINE, limit_s=5.0)
+        await until(lambda: line.status(0.0).state is LineState.OPEN)
+        await until(lambda: device.snapshot.state is DeviceState.ONLINE)
     assert lag.worst_s < MOST_LAG_S
 
 
@@ -115,12 +115,12 @@ async def test_a_terminal_server_that_hangs_holds_nobody_up(bridge: Bridge, devi
         assert bridge.process is not None
         bridge.process.send_signal(signal.SIGSTOP)
         outcomes.append(await ask(line, device, 8))
-        await until(lambda: device.snapshot.state is not DeviceState.ONLINE, limit_s=5.0)
-        began = time.monotonic()
-    stopped_s = time.monotonic() - began
+        await until(lambda: device.snapshot.state is not DeviceState.ONLINE)
+        watch = Stopwatch()
+    stopped_s = watch.s
     assert not isinstance(outcomes[0], bytes)
     assert lag.worst_s < MOST_LAG_S
-    assert stopped_s < 1.5
+    assert stopped_s < 3.0
 
 
 @pytest.fixture
@@ -135,7 +135,7 @@ async def test_a_peer_that_never_negotiates_is_given_up_without_blocking(
 ) -> None:
     url = f"rfc2217://127.0.0.1:{silent_listener}?timeout=0.3"
     async with running(make_line(url, device)) as line, lag_meter() as lag:
-        await until(lambda: "RFC2217" in line.status(0.0).error, limit_s=5.0)
+        await until(lambda: "RFC2217" in line.status(0.0).error)
         assert isinstance(await ask(line, device, 0), LineDown)
     assert lag.worst_s < MOST_LAG_S
     assert sum("event=line_down" in message for message in caplog.messages) == 1
@@ -151,8 +151,8 @@ async def test_a_port_that_opens_after_its_line_was_stopped_is_closed(
     await asyncio.sleep(0)  # its thread has started to open the port
     task.cancel()
     with contextlib.suppress(asyncio.CancelledError):
-        await asyncio.wait_for(task, 1.0)
-    await until(lambda: not set(threading.enumerate()) - before, limit_s=8.0)
+        await asyncio.wait_for(task, 30)
+    await until(lambda: not set(threading.enumerate()) - before)
 
 
 @pytest.mark.parametrize("scheme", ["rfc2217", "socket"])
@@ -195,7 +195,7 @@ async def test_a_port_that_is_lost_again_and_again_is_no_news(
     server = await asyncio.start_server(hang_up, "127.0.0.1", 0)
     port = server.sockets[0].getsockname()[1]
     async with running(make_line(f"socket://127.0.0.1:{port}", device)):
-        await until(lambda: accepted >= 6, limit_s=20.0)
+        await until(lambda: accepted >= 6)
     server.close()
     await server.wait_closed()
     assert sum("event=line_up" in message for message in caplog.messages) <= 1

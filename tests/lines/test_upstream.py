@@ -25,6 +25,7 @@ from gateway.simulator.tcp import TcpServer
 from gateway.simulator.upstream import Habits, SimulatedServer
 from tests.faults.rig import oracle_map
 from tests.lines.rig import lag_meter, until
+from tests.machine import Stopwatch
 
 FAST = PollSettings(live_s=0.2, settings_s=60.0)
 
@@ -58,7 +59,7 @@ async def running(line: UpstreamLine) -> AsyncIterator[UpstreamLine]:
 async def ask(line: UpstreamLine, device: Device, first: int = 0, count: int = 10) -> Outcome:
     done: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
     line.read(device, ReadRequest(Function.READ_HOLDING_REGISTERS, first, count).encode(), done.set_result)
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(30):
         return await done
 
 
@@ -104,10 +105,10 @@ async def test_a_server_that_closes_after_every_reply_gives_no_error_and_no_paus
     simulated = SimulatedServer(controllers(2), habits=Habits(closes=True))
     async with TcpServer(simulated) as server, running(line_to("127.0.0.1", server.port, units)) as line:
         await until(lambda: all_online(units))
-        began = SystemClock().monotonic()
+        watch = Stopwatch()
         for k in range(30):
             assert isinstance(await ask(line, units[k % 2]), bytes)
-        assert SystemClock().monotonic() - began < 3.0
+        assert watch.s < 3.0
         assert set(line.stats.failed) <= {"connection_lost", "exception"}
         assert line.stats.failed["connection_lost"] <= 2, "until its habit is known"
         assert line.stats.opens == 1

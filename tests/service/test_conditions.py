@@ -56,7 +56,7 @@ class Plant:
             self.news.put_nowait(text)
 
     async def wait_for(self, text: str) -> None:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             while await self.news.get() != text:
                 pass
 

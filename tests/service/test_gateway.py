@@ -216,7 +216,7 @@ async def lifetime(config: Config) -> None:
     stop = asyncio.Event()
     running = asyncio.create_task(gateway.run(stop))
     try:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             while gateway.not_ready():  # noqa: ASYNC110  # asked as /readyz asks: there is no event
                 await asyncio.sleep(0.01)
         _, port = next(listener.bound for listener in gateway.listeners if listener.bound is not None)

@@ -64,7 +64,7 @@ async def test_bytes_never_arrive_faster_than_the_wire(oracle: OracleController,
     first = 8 * CHAR + 3.5 * CHAR + 0.015
     early = [at - (first + (k + 1) * CHAR) for k, at in enumerate(times)]
     assert min(early) > -0.0005
-    assert times[-1] < WIRE_S + 1.0  # how late depends on the machine, how early does not
+    assert times[-1] < WIRE_S + 10.0  # how late depends on the machine, how early does not
 
 
 async def test_the_port_is_raw_and_eight_bit_clean(oracle: OracleController) -> None:

@@ -68,7 +68,7 @@ async def test_it_writes_a_line_and_calls_the_handler(
     )
     assert process.stdout is not None
     try:
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(30):
             while b"NET-SNMP version" not in (line := await process.stdout.readline()):
                 assert line, "snmptrapd ended"
             async with gateway.running():

@@ -145,7 +145,7 @@ async def test_no_more_than_two_exports_at_a_time(url: str, days: Days) -> None:
     gate = asyncio.Event()
     days.pieces = [b"one", gate, b"two"]
     running = [asyncio.create_task(get(url)) for _ in range(MAX_EXPORTS)]
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(30):
         while len(days.asked) < MAX_EXPORTS:  # noqa: ASYNC110  # the stub has no event
             await asyncio.sleep(0.005)
     status, _, text = await get(url)
@@ -161,7 +161,7 @@ async def test_a_reader_that_takes_nothing_is_given_up(site: Site, clock: Manual
         port = int(url.split(":")[2].split("/")[0])
         with socket.create_connection(("127.0.0.1", port)) as deaf:
             deaf.sendall(f"GET {URL} HTTP/1.1\r\nHost: x\r\n\r\n".encode())
-            async with asyncio.timeout(10):
+            async with asyncio.timeout(30):
                 while not days.closed:  # noqa: ASYNC110  # the stub has no event
                     await asyncio.sleep(0.005)
         assert (await get(url, "?device=nobody"))[0] == 404

@@ -88,7 +88,7 @@ async def test_a_reply_that_nobody_takes_is_given_up(make_gateway: Callable[...,
         assert bound is not None
         reader, writer = await asyncio.open_connection(*bound, limit=1024)
         writer.write(b"GET /metrics HTTP/1.1\r\nHost: gateway\r\n\r\n")
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             while not gateway.face.stats.abandoned:  # noqa: ASYNC110  a counter sets no event
                 await asyncio.sleep(0.01)
             with contextlib.suppress(ConnectionError):

@@ -51,9 +51,9 @@ async def test_a_handshake_that_does_not_go_on_ends(make_gateway: MakeGateway, t
     crt, key = certificate(tmp_path)
     gateway = make_gateway(tls_certificate=crt, tls_private_key=key, idle_timeout_s=0.05)
     async with gateway.running():
-        async with strangers(gateway, 1) as [(reader, _)], asyncio.timeout(5):
+        async with strangers(gateway, 1) as [(reader, _)], asyncio.timeout(30):
             await reader.read()
-        async with strangers(gateway, 1, b"GET /metrics HTTP/1.1\r\n\r\n") as [(reader, _)], asyncio.timeout(5):
+        async with strangers(gateway, 1, b"GET /metrics HTTP/1.1\r\n\r\n") as [(reader, _)], asyncio.timeout(30):
             await reader.read()  # that is no TLS
 
 
@@ -61,7 +61,7 @@ async def test_stopping_ends_handshakes(make_gateway: MakeGateway, tmp_path: Pat
     crt, key = certificate(tmp_path)
     gateway = make_gateway(tls_certificate=crt, tls_private_key=key, idle_timeout_s=60.0)
     async with gateway.running(), strangers(gateway, 3) as opened:
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(30):
             while gateway.face.stats.connections < 3:  # noqa: ASYNC110 - a counter sets no event
                 await asyncio.sleep(0.001)
         for listener in gateway.face.listeners:

@@ -107,7 +107,7 @@ async def test_strangers_cannot_keep_a_scraper_out(make_gateway: MakeGateway, se
 async def test_a_header_that_does_not_come_ends_the_connection(make_gateway: MakeGateway, sends: bytes) -> None:  # F67
     gateway = make_gateway(idle_timeout_s=0.05)
     async with gateway.running(), strangers(gateway, 1, sends) as [(reader, _)]:
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(30):
             await reader.read()
 
 
@@ -126,7 +126,7 @@ async def test_a_connection_is_used_for_many_scrapes(gateway: Gateway) -> None:
 async def test_garbage_is_refused_and_hurts_nobody(gateway: Gateway, garbage: bytes) -> None:
     async with strangers(gateway, 1, garbage) as [(reader, writer)]:
         writer.write_eof()
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(30):
             answer = await reader.read()
     assert not answer or answer.startswith((b"HTTP/1.1 400", b"HTTP/1.0 400"))
     async with ClientSession() as session, session.get(f"{gateway.url}/healthz") as reply:
@@ -136,6 +136,6 @@ async def test_garbage_is_refused_and_hurts_nobody(gateway: Gateway, garbage: by
 async def test_stop_does_not_wait_for_idle_connections(make_gateway: MakeGateway) -> None:
     gateway = make_gateway(idle_timeout_s=3600.0)
     async with gateway.running(), strangers(gateway, 3, b"GET / HTTP/1.1\r\n") as opened:
-        async with asyncio.timeout(2):
+        async with asyncio.timeout(30):
             await gateway.face.listeners[0].stop()
         assert not any(await asyncio.gather(*(still_open(streams) for streams in opened)))

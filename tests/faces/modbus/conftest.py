@@ -257,7 +257,7 @@ class Client:
         self.send(mbap.encode(tid, unit, pdu))
 
     async def adu(self) -> mbap.Adu:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             head = await self.reader.readexactly(7)
             assert head[2:4] == b"\0\0"
             pdu = await self.reader.readexactly(int.from_bytes(head[4:6]) - 1)
@@ -275,7 +275,7 @@ class Client:
     async def rest(self) -> bytes:
         """What still comes until the server closes; a reset counts as closing."""
         out = bytearray()
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             with contextlib.suppress(ConnectionError):
                 while data := await self.reader.read(65536):
                     out += data
@@ -318,7 +318,7 @@ class Running:
 
     async def until(self, condition: Callable[[], bool]) -> None:
         """Let the loop run until it is so."""
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             while not condition():  # noqa: ASYNC110 - the condition is the kernel's or the server's, which set no event
                 await asyncio.sleep(0.001)
 

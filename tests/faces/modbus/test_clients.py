@@ -99,7 +99,7 @@ async def test_mbpoll_reads_registers(running: Running, peer: Callable[[str], st
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
     )
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(30):
         out, err = await process.communicate()
     assert process.returncode == 0, err
     address = 2 if unit == 12 else 1

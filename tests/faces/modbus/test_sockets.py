@@ -88,7 +88,7 @@ def connected(hub: Hub, opened: list[socket.socket]) -> Pair:
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(30):
         while not condition():  # noqa: ASYNC110 - the condition is the kernel's, which sets no event
             await asyncio.sleep(0.001)
 
@@ -192,7 +192,7 @@ async def test_what_the_kernel_does_not_take_follows_in_order(pair: Pair) -> Non
     transport.write(b"the end")
     sent += b"the end"
     got = b""
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(30):
         while len(got) < len(sent):
             got += await asyncio.to_thread(far.recv, 65536)
     assert got == sent
@@ -212,7 +212,7 @@ async def test_close_sends_the_rest_first_and_then_ends(pair: Pair) -> None:
     transport.write(b"too late")
     assert transport.is_closing()
     got = 0
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(30):
         while piece := await asyncio.to_thread(far.recv, 65536):
             got += len(piece)
     assert got == sent

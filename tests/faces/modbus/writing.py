@@ -167,7 +167,7 @@ class Writing:
 
     async def answer(self, client: int = 0) -> str:
         reader = self.streams[client][0]
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             head = await reader.readexactly(7)
             return (await reader.readexactly(int.from_bytes(head[4:6]) - 1)).hex()
 
@@ -184,7 +184,7 @@ class Writing:
         writer.transport.abort()
 
     async def until(self, condition: Callable[[], object]) -> None:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             while not condition():  # noqa: ASYNC110 - the ledger's thread and the loop set no event of the test's
                 await asyncio.sleep(0.002)
 

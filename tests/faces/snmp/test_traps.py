@@ -116,7 +116,7 @@ def scene(
 
 
 async def until(holds: Callable[[], object]) -> None:
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(30):
         while not holds():  # noqa: ASYNC110 - what a datagram changes sets no event
             await asyncio.sleep(0.01)
 

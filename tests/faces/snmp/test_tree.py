@@ -120,14 +120,14 @@ def test_a_step_over_a_site_of_silent_devices_is_short(
         device.line = line
     tree = SnmpAgent(settings, Site.of("big", (line,), devices), clock, modbus_stats).tree
     tree.refresh()
-    before = time.perf_counter()
+    before = time.thread_time()
     steps = [tree.after(LIVE, clock.now) for _ in range(100)]
-    assert time.perf_counter() - before < 0.1
+    assert time.thread_time() - before < 0.1
     assert steps[0] is not None
     assert steps[0][0][:-4] == (*LIVE[:-2], 8)  # the condition table, which is behind the values
-    before = time.perf_counter()
+    before = time.thread_time()
     steps = [tree.after((*SENSOR_VALUE, 0), clock.now) for _ in range(10)]
-    assert time.perf_counter() - before < 0.1
+    assert time.thread_time() - before < 0.1
     assert steps[0] is not None
     assert steps[0][0][:-1] == (*SENSOR_VALUE[:-1], 5)
 

@@ -45,7 +45,7 @@ class Trapd:
     async def next(self) -> Got:
         """The next notification; fails when none comes."""
         assert self.process.stdout is not None
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(30):
             while line := await self.process.stdout.readline():
                 got = parse(line.decode())
                 if got is not None:
@@ -83,7 +83,7 @@ async def trapd(
     )  # fmt: skip
     assert process.stdout is not None
     try:
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(30):
             while b"NET-SNMP version" not in await process.stdout.readline():
                 pass
         yield Trapd(process, port)

@@ -40,7 +40,7 @@ class Unit(OracleController):
 
     async def is_quiet(self) -> None:
         """Wait until the polls of the start are over, so that the next request on the line is a client's."""
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(60):
             count = -1
             while count != len(self.asked):
                 count = len(self.asked)
@@ -57,7 +57,7 @@ class NotifySocket:
         self.path = str(path)
         self.told: list[str] = []
 
-    async def next(self, beginning: str, timeout_s: float = 40.0) -> str:
+    async def next(self, beginning: str, timeout_s: float = 60.0) -> str:
         """The next message that begins so."""
         async with asyncio.timeout(timeout_s):
             while True:
@@ -119,7 +119,7 @@ class Service:
         """The running gateway as the end-to-end tests see it."""
         return Running(self.folder, *self.ports, self.programs[-1], None)
 
-    async def log(self, pattern: str, timeout_s: float = 40.0) -> str:
+    async def log(self, pattern: str, timeout_s: float = 60.0) -> str:
         """The next line of the log that matches."""
         return await asyncio.to_thread(self.programs[-1].wait_for, pattern, timeout_s)
 
@@ -161,7 +161,7 @@ class Client:
         """Send bytes as they are."""
         self._writer.write(data)
 
-    async def reply(self, timeout_s: float = 10.0) -> bytes:
+    async def reply(self, timeout_s: float = 30.0) -> bytes:
         """The PDU of the next reply; b"" when the connection is over."""
         async with asyncio.timeout(timeout_s):
             try:
@@ -193,7 +193,7 @@ async def client(port: int) -> AsyncIterator[Client]:
             await writer.wait_closed()
 
 
-async def until(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
+async def until(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
     """Wait for a state that only the outside world brings about."""
     async with asyncio.timeout(timeout_s):
         while not condition():  # noqa: ASYNC110 - there is no event for it

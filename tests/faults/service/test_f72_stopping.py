@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
+from gateway.service.settings import STOP_GRACE_S
 from tests.faces.modbus.tls.conftest import pki
 from tests.faces.modbus.tls.site import Pki
 from tests.faults.service.rig import QUIET, Service, client, read
@@ -21,7 +22,7 @@ async def test_the_wire_is_waited_for_the_queue_is_06_and_nobody_new_gets_in(ser
     await service.online()
     unit = service.units["shelter-a"][0]
     await unit.is_quiet()
-    unit.turnaround_s = 1.0
+    unit.turnaround_s = 2.0
     async with client(service.modbus) as on_the_wire, client(service.modbus) as waits, client(service.modbus) as idle:
         on_the_wire.ask(11, read(0xE000, 2))
         await unit.is_asked(read(0xE000, 2))
@@ -33,7 +34,8 @@ async def test_the_wire_is_waited_for_the_queue_is_06_and_nobody_new_gets_in(ser
         program.process.terminate()
         assert await waits.reply() == b"\x81\x06"
         assert await waits.reply() == b"\x83\x06"
-        assert time.monotonic() - began < 0.7
+        with pytest.raises(TimeoutError):  # they did not wait for it
+            await on_the_wire.reply(timeout_s=0.01)
         assert await waits.reply() == b""
         assert await idle.reply() == b""
         with pytest.raises(OSError):
@@ -42,7 +44,7 @@ async def test_the_wire_is_waited_for_the_queue_is_06_and_nobody_new_gets_in(ser
         assert await on_the_wire.reply() == expected
         assert await on_the_wire.reply() == b""
     assert await service.end() == 0
-    assert time.monotonic() - began < 3.0
+    assert time.monotonic() - began < 10.0
     assert "Traceback" not in program.log()
     assert "stop_late" not in program.log()
 
@@ -62,7 +64,7 @@ async def test_a_controller_that_takes_for_ever_is_given_up_after_five_seconds(s
         assert await asker.reply() == b"\x83\x06"
         assert await asker.reply() == b""
     assert await service.end() == 0
-    assert time.monotonic() - began < 7.0
+    assert time.monotonic() - began < 10.0
     assert "Traceback" not in program.log()
 
 
@@ -92,5 +94,5 @@ client_ca_file = "{files.client_ca}"
             for one in (silent, half, frame, scraper):
                 assert await one.reply() == b""
     assert await service.end() == 0
-    assert time.monotonic() - began < 3.0
+    assert time.monotonic() - began < STOP_GRACE_S
     assert "Traceback" not in program.log()

@@ -24,9 +24,8 @@ async def test_a_second_signal_does_not_wait(service: Service, second: signal.Si
         await unit.is_asked(read(0xE000, 2))
         program.process.terminate()
         await service.log("event=stopping signal=SIGTERM")
-        began = time.monotonic()
         assert await service.end(second) == 0
-        assert time.monotonic() - began < 2.0
+        assert await asker.reply() == b""  # who waits for the first signal alone is answered 06 after four seconds
     assert "Traceback" not in program.log()
 
 

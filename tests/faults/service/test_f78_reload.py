@@ -143,7 +143,7 @@ async def test_what_did_not_change_does_not_notice(service: Service) -> None:
             await reload(service)
     assert reader.replies == {b"\x03\x04"}
     assert reader.count > 20
-    assert reader.worst_s < 3.0
+    assert reader.worst_s < 10.0
     assert await port_of(service, "shelter-a") == port
     assert opens.findall((await service.get("/metrics"))[1]) == ["1.0"]
     assert await service.end() == 0

@@ -48,7 +48,7 @@ async def test_data_are_served_and_everybody_is_told(service: Service, peer: Cal
         assert (await asker.read(11))[:2] == b"\x03\x04"
     assert await asyncio.to_thread(snmp_get, snmpget, service, *noc) == "ridge-07"  # with a new engine id, announced
     assert (await service.get("/healthz"))[0] == (await service.get("/readyz"))[0] == 200
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(30):
         while not RAISED.search((await service.get("/metrics"))[1]):  # noqa: ASYNC110 - the process has no event for it
             await asyncio.sleep(0.1)
     assert "prostar_gateway_history_store_up 0.0" in (await service.get("/metrics"))[1]

@@ -19,7 +19,7 @@ async def test_it_is_paused_then_cut_off(running: Running) -> None:
     client.reader._transport.pause_reading()  # type: ignore[attr-defined]
     burst = mbap.encode(1, 12, bytes.fromhex("03 0000 0050")) * 1000
     connection = next(iter(running.server._connections))
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(30):
         while connection._unsent_since is None:
             client.send(burst)
             await asyncio.sleep(0.001)
@@ -41,7 +41,7 @@ async def test_who_takes_its_replies_late_gets_them_all(running: Running) -> Non
     client.reader._transport.pause_reading()  # type: ignore[attr-defined]
     connection = next(iter(running.server._connections))
     count = 0
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(30):
         while connection._unsent_since is None:
             client.send(mbap.encode(1, 12, bytes.fromhex("03 0000 0050")) * 1000)
             count += 1000

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from statistics import median
-
 from gateway.modbus import mbap
 from tests.faces.modbus.conftest import Running, read
 
@@ -19,11 +16,8 @@ async def test_a_slow_serial_request_delays_only_its_own_connection(running: Run
     slow.ask(1, 11, asked)
     slow.ask(2, 12, cached)
     await running.until(lambda: len(world.line(11).waiting) == 1)
-    taken_s = []
     for tid in range(50):
-        asked_at = time.perf_counter()
         assert await other.query(12, cached, tid) == cached_reply
-        taken_s.append(time.perf_counter() - asked_at)
-    assert median(taken_s) < 0.01
+    assert len(world.line(11).waiting) == 1  # the slow one still is
     world.line(11).release()
     assert await slow.adus(2) == [mbap.Adu(1, 11, asked_reply), mbap.Adu(2, 12, cached_reply)]

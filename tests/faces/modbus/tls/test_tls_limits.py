@@ -60,7 +60,7 @@ class Hand:
 
     async def received(self, size: int) -> bytes:
         got = b""
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             while len(got) < size:
                 try:
                     got += self.tls.read(65536)
@@ -112,7 +112,9 @@ async def test_f30_a_record_that_is_not_completed_ends_its_connection(serve_tls:
 async def test_the_first_request_does_not_wait_for_a_delayed_acknowledgement(serve_tls: ServeTls) -> None:
     site = await serve_tls()
     context = site.pki.client("reader", ssl.TLSVersion.TLSv1_3)
-    took_s = [await asyncio.to_thread(_first_request, context, site.running.address) for _ in range(5)]
+    took_s = [await asyncio.to_thread(_first_request, context, site.running.address)]
+    while took_s[-1] >= 0.035 and len(took_s) < 50:  # the one of a moment when the machine is not busy counts
+        took_s.append(await asyncio.to_thread(_first_request, context, site.running.address))
     assert min(took_s) < 0.035  # Linux acknowledges after 40 ms unless told otherwise
 
 
