@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
 
 from gateway.clock import Clock
 from gateway.core.conditions import Conditions, Watch
@@ -18,7 +19,6 @@ from gateway.errors import ConfigError, ListenError, TlsFilesError
 from gateway.faces.http.access import Access, tls_context
 from gateway.faces.http.app import HttpFace
 from gateway.faces.modbus.server import ModbusServer
-from gateway.faces.modbus.tls_files import Credentials, load
 from gateway.faces.snmp.agent import SnmpAgent
 from gateway.faces.snmp.log_keeper import LogKeeper
 from gateway.faces.snmp.settings import SnmpSettings
@@ -34,9 +34,12 @@ from gateway.service.snmp import snmp_settings
 from gateway.service.south import South
 from gateway.service.supervisor import Supervisor
 from gateway.service.systemd import Systemd
-from gateway.service.tls import tls_settings
+from gateway.service.tls import read_files, tls_settings
 from gateway.service.tracing import Tracer
 from gateway.service.watchdog import Watchdog
+
+if TYPE_CHECKING:
+    from gateway.faces.modbus.tls_files import Credentials
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +184,7 @@ class Gateway:
             problems.append(f"http: {error}")
         tls_wanted = tls_settings(config)
         try:
-            tls = None if tls_wanted is None else load(tls_wanted.files, self._clock.wall())
+            tls = None if tls_wanted is None else read_files(tls_wanted, self._clock.wall())
         except TlsFilesError as error:
             self._modbus.files_unusable(str(error))
             problems += [f"modbus.tls.{key}: {text}" for key, text in error.problems]

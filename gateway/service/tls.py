@@ -6,16 +6,21 @@ other faces do not need them. `check-config` calls them problems; a running gate
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import timedelta
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gateway.errors import TlsFilesError
-from gateway.faces.modbus.settings import TlsSettings
-from gateway.faces.modbus.tls_files import TlsFiles, exposed_key, load
+from gateway.faces.modbus.settings import TlsFiles, TlsSettings
 from gateway.faces.modbus.tls_names import Names, wanted_names
 from gateway.service.keys import parse_listen
 from gateway.service.schema import Config
+
+if TYPE_CHECKING:
+    from gateway.faces.modbus.tls_files import Credentials
 
 SOON_S = timedelta(days=30).total_seconds()
 
@@ -39,13 +44,20 @@ def tls_settings(config: Config) -> TlsSettings | None:
     )
 
 
+def read_files(settings: TlsSettings, now: float) -> Credentials:
+    """What is in the files at wall time `now`; TlsFilesError with every problem. Loads cryptography."""
+    from gateway.faces.modbus.tls_files import load  # noqa: PLC0415 - only sites with TLS pay its 9 MiB
+
+    return load(settings.files, now)
+
+
 def tls_problems(config: Config, now: float) -> tuple[str, ...]:
     """What is wrong with the files at wall time `now`, each with its key path."""
     settings = tls_settings(config)
     if settings is None:
         return ()
     try:
-        load(settings.files, now)
+        read_files(settings, now)
     except TlsFilesError as error:
         return tuple(f"modbus.tls.{key}: {text}" for key, text in error.problems)
     return ()
@@ -59,10 +71,10 @@ def tls_advice(config: Config, now: float) -> Iterator[str]:
             yield f"modbus.write[{index}].role: holds for nobody, because [modbus.tls] does not listen"
     if settings is None:
         return
-    if exposed_key(settings.files):
+    if _exposed(settings.files):
         yield f"modbus.tls.key_file: {settings.files.key} can be read by every user of this machine"
     try:
-        credentials = load(settings.files, now)
+        credentials = read_files(settings, now)
     except TlsFilesError as error:
         for key, text in error.problems:
             yield f"modbus.tls.{key}: {text}; the TLS port stays closed until that is mended"
@@ -86,3 +98,10 @@ def _own_names(config: Config, names: Names) -> Iterator[str]:
         for at, text in enumerate(listen):
             if not names.lead_to(parse_listen(text).host):
                 yield f"{path}.listen[{at}]: the server's certificate is for {names}, not for {text}, {refused}"
+
+
+def _exposed(files: TlsFiles) -> bool:
+    """Whether any user of the machine can read the key."""
+    with suppress(OSError):
+        return bool(files.key.stat().st_mode & stat.S_IROTH)
+    return False

@@ -15,6 +15,7 @@ import logging
 import socket
 from collections.abc import Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 from gateway import __version__
 from gateway.clock import Clock
@@ -34,9 +35,11 @@ from gateway.faces.modbus.dispatch import Dispatcher, Routes, Shared
 from gateway.faces.modbus.settings import ModbusSettings, TlsSettings
 from gateway.faces.modbus.sockets import Hub, SocketTransport
 from gateway.faces.modbus.tcp import allowed, bind_problem
-from gateway.faces.modbus.tls import TlsDoor
-from gateway.faces.modbus.tls_files import Credentials
 from gateway.faces.modbus.writer import Writer
+
+if TYPE_CHECKING:  # 9 MiB that only sites with TLS pay
+    from gateway.faces.modbus.tls import TlsDoor
+    from gateway.faces.modbus.tls_files import Credentials
 
 logger = logging.getLogger(__name__)
 
@@ -216,6 +219,8 @@ class ModbusServer:
             dispatcher.reroute(routes.of_line(group.line), self._shared)
 
     def _new_door(self, settings: TlsSettings) -> TlsDoor:
+        from gateway.faces.modbus.tls import TlsDoor  # noqa: PLC0415 - as said above
+
         self.stats.tls = TlsStats()
         barred = Dispatcher({}, self._clock, self._shared, barred=True)
         return TlsDoor(settings, barred, self._clock, self.stats.tls, frame_timeout_s=self.settings.frame_timeout_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from pathlib import Path
@@ -9,7 +10,6 @@ from pathlib import Path
 from gateway.core.ratelimit import ClientRate, LineRates
 from gateway.core.write_rules import WriteRule
 from gateway.core.write_wear import WearLimits
-from gateway.faces.modbus.tls_files import TlsFiles
 from gateway.faces.modbus.tls_names import WantedNames
 
 Network = IPv4Network | IPv6Network
@@ -51,6 +51,24 @@ class WriteSettings:
     rules: tuple[WriteRule, ...]
     ledger: Path
     limits: WearLimits = field(default_factory=WearLimits)
+
+
+@dataclass(frozen=True, slots=True)
+class TlsFiles:
+    """Where they are: PEM files."""
+
+    certificate: Path  # the server's own first, then its issuers up to the root (R-46)
+    key: Path  # without a passphrase
+    client_ca: Path  # who is trusted to issue certificates of clients
+    crl: Path | None = None  # those of all issuers of client certificates
+
+    def named(self) -> Iterator[tuple[str, Path]]:
+        """Each file with the configuration's key for it."""
+        yield "certificate_file", self.certificate
+        yield "key_file", self.key
+        yield "client_ca_file", self.client_ca
+        if self.crl is not None:
+            yield "crl_file", self.crl
 
 
 @dataclass(frozen=True, slots=True)

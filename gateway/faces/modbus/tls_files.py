@@ -14,11 +14,8 @@ from __future__ import annotations
 import os
 import re
 import ssl
-import stat
 import weakref
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -28,6 +25,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat,
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from gateway.errors import TlsFilesError
+from gateway.faces.modbus.settings import TlsFiles
 from gateway.faces.modbus.tls_names import Names, names_of
 
 MAX_BYTES = 1 << 20
@@ -45,24 +43,6 @@ SHA-256 or better (R-50 to R-55), a new key each time. TLS 1.3 has suites of its
 _CRL_BLOCK = re.compile(rb"-----BEGIN X509 CRL-----.+?-----END X509 CRL-----\r?\n?", re.DOTALL)
 
 Problems = list[tuple[str, str]]
-
-
-@dataclass(frozen=True, slots=True)
-class TlsFiles:
-    """Where they are: PEM files."""
-
-    certificate: Path  # the server's own first, then its issuers up to the root (R-46)
-    key: Path  # without a passphrase
-    client_ca: Path  # who is trusted to issue certificates of clients
-    crl: Path | None = None  # those of all issuers of client certificates
-
-    def named(self) -> Iterator[tuple[str, Path]]:
-        """Each file with the configuration's key for it."""
-        yield "certificate_file", self.certificate
-        yield "key_file", self.key
-        yield "client_ca_file", self.client_ca
-        if self.crl is not None:
-            yield "crl_file", self.crl
 
 
 class Credentials:
@@ -132,13 +112,6 @@ def load(files: TlsFiles, now: float) -> Credentials:
         reason = (error.reason or "refused").lower().replace("_", " ")
         raise TlsFilesError((("certificate_file", f"OpenSSL does not take these files: {reason}"),)) from None
     return credentials
-
-
-def exposed_key(files: TlsFiles) -> bool:
-    """Whether any user of the machine can read the key."""
-    with suppress(OSError):
-        return bool(files.key.stat().st_mode & stat.S_IROTH)
-    return False
 
 
 def _read(key: str, path: Path, problems: Problems) -> bytes | None:

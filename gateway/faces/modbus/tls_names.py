@@ -14,8 +14,10 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
+from typing import TYPE_CHECKING
 
-from cryptography import x509
+if TYPE_CHECKING:
+    from cryptography import x509
 
 Address = IPv4Address | IPv6Address
 Network = IPv4Network | IPv6Network
@@ -82,6 +84,8 @@ class WantedNames:
 
 def names_of(certificate: x509.Certificate) -> Names:
     """The names of a certificate whose extensions can be read."""
+    from cryptography import x509  # noqa: PLC0415 - for who has a certificate; the settings import this file
+
     try:
         entries = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:

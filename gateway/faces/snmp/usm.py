@@ -7,6 +7,7 @@ Rules:
    with them everything that costs time, so that a message costs a few library calls.
 3. AES-192 and AES-256 take the first octets of the localized key, on which net-snmp and pysnmp agree as long as the
    digest is long enough. Where it is not (SHA-224 with AES-256), vendors stretch it in different ways: refused.
+4. The library with AES (cfb.py) is loaded for the first user: sites without SNMPv3 do not pay its 9 MiB.
 """
 
 from __future__ import annotations
@@ -17,18 +18,12 @@ import secrets
 from dataclasses import dataclass
 from enum import Enum
 
-from cryptography.hazmat.decrepit.ciphers.modes import CFB
-from cryptography.hazmat.primitives.ciphers import Cipher
-from cryptography.hazmat.primitives.ciphers.algorithms import AES
-from cryptography.hazmat.primitives.ciphers.modes import ECB
-
 from gateway.faces.snmp.secret import Secret
 
 MIN_PASS_PHRASE = 8
 _EXPANDED = 1 << 20
 """RFC 3414 §A.2: the pass phrase is repeated to this many octets before it is hashed."""
 
-_BLOCK = 16
 _SALT_MASK = (1 << 64) - 1
 
 
@@ -80,36 +75,6 @@ def localized(auth: Auth, key: bytes, engine_id: bytes) -> bytes:
     return hashlib.new(auth.digest, key + engine_id + key).digest()
 
 
-class Cfb:
-    """AES in 128-bit CFB with one key, for any number of messages.
-
-    Making a cipher costs thirty times what a message costs, so both contexts are kept and each message is put behind
-    its initialization vector: a CFB decryptor takes it as the ciphertext before, an encryptor is given the plaintext
-    that becomes it. tests/faces/snmp/test_usm.py compares with one cipher a message.
-    """
-
-    __slots__ = ("_block", "_decryptor", "_encryptor", "_last")
-
-    def __init__(self, key: bytes) -> None:
-        cipher = Cipher(AES(key), CFB(bytes(_BLOCK)))
-        self._decryptor = cipher.decryptor()
-        self._encryptor = cipher.encryptor()
-        self._block = Cipher(AES(key), ECB()).encryptor()  # noqa: S305 - single blocks: the building stone of CFB
-        self._last = bytes(_BLOCK)
-
-    def decrypt(self, vector: bytes, data: bytes) -> bytes:
-        """The plaintext of `data`; `vector` has 16 octets."""
-        return self._decryptor.update(vector + data + bytes(-len(data) % _BLOCK))[_BLOCK : _BLOCK + len(data)]
-
-    def encrypt(self, vector: bytes, data: bytes) -> bytes:
-        """The ciphertext of `data`, of the same length; `vector` has 16 octets."""
-        stream = int.from_bytes(self._block.update(self._last), "big")
-        lead = (int.from_bytes(vector, "big") ^ stream).to_bytes(_BLOCK, "big")
-        out = self._encryptor.update(lead + data + bytes(-len(data) % _BLOCK))
-        self._last = out[-_BLOCK:]
-        return out[_BLOCK : _BLOCK + len(data)]
-
-
 class Mac:
     """HMAC with one key, its two halves begun once."""
 
@@ -153,6 +118,8 @@ class LocalUser:
     __slots__ = ("_salt", "cfb", "credentials", "mac", "name")
 
     def __init__(self, credentials: Credentials, engine_id: bytes) -> None:
+        from gateway.faces.snmp.cfb import Cfb  # noqa: PLC0415 - rule 4
+
         auth, priv = credentials.auth, credentials.priv
         self.credentials = credentials
         self.name = credentials.name
@@ -174,10 +141,12 @@ class LocalUser:
 
     def _self_test(self, auth_key: bytes, priv_key: bytes) -> None:
         """RuntimeError when the machine's libraries do not do what this module believes of them."""
-        vector, sample = secrets.token_bytes(_BLOCK), secrets.token_bytes(45)
-        once = Cipher(AES(priv_key), CFB(vector)).encryptor().update(sample)
+        from gateway.faces.snmp.cfb import BLOCK, once  # noqa: PLC0415 - rule 4
+
+        vector, sample = secrets.token_bytes(BLOCK), secrets.token_bytes(45)
+        expected = once(priv_key, vector, sample)
         auth, priv = self.credentials.auth, self.credentials.priv
         if self.mac.of(sample) != hmac.digest(auth_key, sample, auth.digest)[: self.mac.size]:
             raise RuntimeError(f"{auth.label} is not usable on this machine")
-        if self.cfb.encrypt(vector, sample) != once or self.cfb.decrypt(vector, once) != sample:
+        if self.cfb.encrypt(vector, sample) != expected or self.cfb.decrypt(vector, expected) != sample:
             raise RuntimeError(f"{priv.label} is not usable on this machine")

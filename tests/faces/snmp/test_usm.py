@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from pyasn1.type import univ
 
 from gateway.faces.snmp import usm
-from gateway.faces.snmp.usm import Auth, Cfb, LocalUser, Mac, Priv
+from gateway.faces.snmp.cfb import Cfb
+from gateway.faces.snmp.usm import Auth, LocalUser, Mac, Priv
 from tests.faces.snmp.poller import credentials
 
 ENGINE_ID = bytes.fromhex("80007ed9050102030405060708")

@@ -30,7 +30,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from pyasn1.codec.der import decoder, encoder
 from pyasn1.type import char, univ
 
-from gateway.faces.modbus.tls_files import TlsFiles
+from gateway.faces.modbus.settings import TlsFiles
 
 DOCUMENT = Path(__file__).parents[4] / "docs" / "tls.md"
 ODD = x509.ObjectIdentifier("1.3.6.1.4.1.50316.802.2")
