@@ -12,6 +12,7 @@ from pathlib import Path
 from gateway.faces.snmp.settings import DEFAULT_ROOT, Oid
 from gateway.generate.dashboards import dashboard_outputs
 from gateway.generate.librenms import librenms_outputs
+from gateway.generate.maps import map_outputs
 from gateway.generate.metrics import metric_outputs
 from gateway.generate.mib import LOCK, mib_outputs
 from gateway.generate.registers import register_outputs
@@ -28,6 +29,7 @@ _PAGES = "docs/registers/"
 def outputs() -> dict[str, str]:
     """Every derived file: path from the repository's root → text."""
     return _together(
+        map_outputs(),
         mib_outputs(),
         register_outputs(),
         status_outputs(),

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
+from gateway.devices.forms import parse_map
 from gateway.devices.model import DeviceMap
-from gateway.devices.schema import parse_map
 
 SMALL = """
 model = "small"

@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.devices.decode import Decoder
+from gateway.devices.forms import parse_map
 from gateway.devices.model import DeviceMap, Space
-from gateway.devices.schema import load_map, parse_map
+from gateway.devices.schema import load_map
 from gateway.errors import MapError
 
 BLOCK = struct.pack(">8H", 0x4AA0, 0, 0x0001, 0x0002, 1, 0x8001, 0x4D00, 0)

@@ -6,9 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateway.devices.forms import parse_map
 from gateway.devices.model import DeviceMap, PollClass, Space
 from gateway.devices.plan import PlannedBlock, poll_plan, split
-from gateway.devices.schema import load_map, models, parse_map
+from gateway.devices.schema import load_map, models
 
 REGISTERS = Space.REGISTERS
 

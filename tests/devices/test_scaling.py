@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from gateway.devices.codecs import read_words, write_words
 from gateway.devices.decode import Decoder
+from gateway.devices.forms import parse_map
 from gateway.devices.model import Reading, Released, Space, WordOrder
-from gateway.devices.schema import parse_map
 from gateway.errors import MapError
 
 Change = Callable[..., str]

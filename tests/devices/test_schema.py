@@ -6,8 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateway.devices.forms import parse_map
 from gateway.devices.model import Access, DeviceMap, Group, PollClass, Space, WordOrder
-from gateway.devices.schema import load_map, models, parse_map
+from gateway.devices.schema import load_map, models
 from gateway.errors import MapError
 
 Change = Callable[..., str]
