@@ -1,15 +1,16 @@
 """What the engine keeps of one device, and how replies become snapshots.
 
-The parts (one a planned block) are merged into a new immutable `Snapshot` after each poll. A value is
-always decoded from one read, and carries the time at which that read's request went out. The scaling of a device that
-tells its own may come from another read; when it turns out to be another one, everything is decoded anew.
+The values of each block that was read take the place of what was read of its points before, in a new immutable
+`Snapshot` after each poll. A value is always decoded from one read, and carries the time at which that read's request
+went out. The scaling of a device that tells its own may come from another read; when it turns out to be another one,
+everything is decoded anew.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from types import MappingProxyType
 
 from gateway.core.doubt import Doubt
@@ -23,8 +24,6 @@ from gateway.devices.model import DeviceMap, Identification, Space, Value
 
 HEARD_S = 0.05
 
-PartKey = tuple[Space, int, int]
-
 
 def _decoder(device: Device) -> Decoder:
     """By the readings that were chosen; for a model that was found, those of them that it has."""
@@ -36,13 +35,35 @@ def _decoder(device: Device) -> Decoder:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """A block as it was read, and what it says."""
+class _Times(Mapping[str, float]):
+    """When the points that have a value were read: what `Snapshot.read_at` says, without a dictionary a snapshot."""
 
-    block: Block
-    values: Mapping[str, Value]
-    texts: Mapping[str, str]
+    __slots__ = ("_parts", "_texts", "_values")
+
+    def __init__(
+        self, values: Mapping[str, Value], texts: Mapping[str, str], parts: tuple[tuple[frozenset[str], float], ...]
+    ) -> None:
+        """`parts` are the names of the points in each block and the time of the block; no name is in two of them."""
+        self._values = values
+        self._texts = texts
+        self._parts = parts
+
+    def __getitem__(self, name: str) -> float:
+        if name in self:
+            for names, read_at in self._parts:
+                if name in names:
+                    return read_at
+        raise KeyError(name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._values or name in self._texts
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self._values
+        yield from self._texts
+
+    def __len__(self) -> int:
+        return len(self._values) + len(self._texts)
 
 
 class DeviceRecord:
@@ -60,7 +81,7 @@ class DeviceRecord:
         self.live_started_at: float | None = None
         self.doubt = Doubt()
         self._decoder = _decoder(device)
-        self._parts: dict[PartKey, _Part] = {}
+        self._blocks: list[Block] = []  # no address is in two of them
         self._scaling: dict[str, Value] = {}  # what the device last told of it, since the line was opened
         device.snapshot = Snapshot(state_since=now)
 
@@ -101,20 +122,21 @@ class DeviceRecord:
 
     def store(self, block: Block, now: float) -> None:
         """Take in a block that was read by a poll and publish a new snapshot."""
-        part = self._decoded(block)
-        self._parts[(block.space, block.first, block.count)] = part
-        told = {name: part.values[name] for name in self._decoder.factors if name in part.values}
+        values, texts = self._without(block.space, block.first, block.first + block.count)
+        self._blocks.append(block)
+        found = self._decode(block, values, texts)
+        told = {name: found[name] for name in self._decoder.factors if name in found}
         if told.items() - self._scaling.items():
             self._scaling.update(told)
-            self._parts = {key: self._decoded(each.block) for key, each in self._parts.items()}
+            values, texts = {}, {}
+            for each in self._blocks:
+                self._decode(each, values, texts)
         self.device.stats.implausible = self._decoder.implausible
-        self._merge(last_reply_at=now)
+        self._show(values, texts, last_reply_at=now)
 
     def forget(self, space: Space, first: int, end: int) -> None:
         """Drop what was read of these addresses: it was written, or is no longer read as one block."""
-        for key in [k for k in self._parts if k[0] is space and k[1] < end and first < k[1] + k[2]]:
-            del self._parts[key]
-        self._merge()
+        self._show(*self._without(space, first, end))
 
     def heard(self, now: float) -> None:
         """The device answered something that is not a poll's block; noted to `HEARD_S`, for it makes a new snapshot."""
@@ -139,7 +161,7 @@ class DeviceRecord:
         """Another unit may stand there now: nothing of the old one is kept but what is known of its identity."""
         self.verified = False
         self.live_started_at = None
-        self._parts.clear()
+        self._blocks = []
         self._scaling.clear()
         self._publish(identification=None, serial_number=None)
 
@@ -158,28 +180,42 @@ class DeviceRecord:
         self._publish(state=state, state_since=now)
         return lasted_s
 
-    def _merge(self, **changes: object) -> None:
-        merged: dict[str, Value] = {}
-        texts: dict[str, str] = {}
-        read_at: dict[str, float] = {}
-        for part in self._parts.values():
-            merged.update(part.values)
-            read_at.update(dict.fromkeys(part.values, part.block.read_at))
-            if part.texts:
-                texts.update(part.texts)
-                read_at.update(dict.fromkeys(part.texts, part.block.read_at))
-        self._publish(
-            blocks=tuple(part.block for part in self._parts.values()),
-            values=MappingProxyType(merged),
-            texts=MappingProxyType(texts),
-            read_at=MappingProxyType(read_at),
-            **changes,
+    def _without(self, space: Space, first: int, end: int) -> tuple[dict[str, Value], dict[str, str]]:
+        """Drop the blocks that have one of these addresses; gives the values and texts of the others."""
+        snapshot = self.device.snapshot
+        kept, gone = [], set[str]()
+        for block in self._blocks:
+            if block.space is space and block.first < end and first < block.first + block.count:
+                gone |= self._decoder.names(block.space, block.first, block.count)
+            else:
+                kept.append(block)
+        self._blocks = kept
+        if not kept:
+            return {}, {}
+        return (
+            {name: value for name, value in snapshot.values.items() if name not in gone},
+            {name: text for name, text in snapshot.texts.items() if name not in gone},
         )
 
-    def _decoded(self, block: Block) -> _Part:
-        decode = self._decoder
-        values = decode.decode(block.space, block.first, block.data, block.count, self._scaling)
-        return _Part(block, values, decode.texts(block.space, block.first, block.data))
+    def _decode(self, block: Block, values: dict[str, Value], texts: dict[str, str]) -> Mapping[str, Value]:
+        """Add what a block says; gives its values."""
+        decoder = self._decoder
+        found = decoder.decode(block.space, block.first, block.data, block.count, self._scaling)
+        values.update(found)
+        texts.update(decoder.texts(block.space, block.first, block.data))
+        return found
+
+    def _show(self, values: dict[str, Value], texts: dict[str, str], **changes: object) -> None:
+        names = self._decoder.names
+        parts = tuple((names(block.space, block.first, block.count), block.read_at) for block in self._blocks)
+        small, few = dict(values), dict(texts)  # a copy takes half the room of what grew
+        self._publish(
+            blocks=tuple(self._blocks),
+            values=MappingProxyType(small),
+            texts=MappingProxyType(few),
+            read_at=_Times(small, few, parts),
+            **changes,
+        )
 
     def _publish(self, **changes: object) -> None:
         old = self.device.snapshot

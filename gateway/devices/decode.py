@@ -7,9 +7,9 @@ Rule 4: commands are never decoded.
 Rule 5: a point that the device scales has no value until the points that tell the scaling have one; of the same
         block if they lie in it, else as the caller knows them.
 
-What to do with a block is worked out once per block form and kept: three `struct` formats, one for the half
-floats, one for what the device scales and one for everything else, each naming exactly its points and skipping the
-bytes between.
+What to do with a block is worked out once per block form and kept, for all devices of a model that are read alike:
+three `struct` formats, one for the half floats, one for what the device scales and one for everything else, each
+naming exactly its points and skipping the bytes between.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from gateway.errors import MapError
 _HALF_BOUNDS = (-65504.0, 65504.0)  # the finite halves: infinity is outside, NaN compares with nothing
 _NO_BOUNDS = (-math.inf, math.inf)
 _MAX_FORMS = 64  # a device is polled in a handful of block forms; a caller with more only loses the cache
+_MAX_KINDS = 32  # of devices, as they are read: models, and readings that were chosen
 
 _Convert = Callable[[int], Value | None]
 _NOTHING: Mapping[str, Value] = MappingProxyType({})
@@ -44,6 +45,7 @@ class _Form:
     scaled: Struct
     scaled_points: tuple[tuple[str, _Convert | None, float, float, tuple[str, ...]], ...]
     texts: tuple[tuple[str, slice, Reading], ...]
+    names: frozenset[str]  # of all points that it decodes
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,9 +80,8 @@ class Decoder:
 
     def __init__(self, device_map: DeviceMap, readings: Mapping[str, str] | None = None) -> None:
         self.implausible = 0
-        self._points = _bind(device_map, dict(readings or {}))
-        self.factors = frozenset(name for bound in self._points for name in bound.reading.factors)
-        self._forms: dict[tuple[Space, int, int], _Form] = {}
+        self._forms = _forms(device_map, dict(readings or {}))
+        self.factors = self._forms.factors
 
     def decode(
         self, space: Space, first: int, data: bytes, count: int | None = None, known: Mapping[str, Value] = _NOTHING
@@ -94,7 +95,7 @@ class Decoder:
         if space is Space.COILS:
             count = min(8 * len(data), 8 * len(data) if count is None else count)
             data = b"".join((b"\x00\x01" if data[n >> 3] >> (n & 7) & 1 else b"\x00\x00") for n in range(count))
-        form = self._form(space, first, len(data))
+        form = self._forms.of(space, first, len(data))
         values: dict[str, Value] = {}
         for (name, low, high), half in zip(form.half_points, form.halves.unpack(data), strict=True):
             if low <= half <= high:
@@ -119,9 +120,13 @@ class Decoder:
             return {}
         found = (
             (name, decode_text(reading.codec, data[place], reading.order))
-            for name, place, reading in self._form(space, first, len(data)).texts
+            for name, place, reading in self._forms.of(space, first, len(data)).texts
         )
         return {name: text for name, text in found if text is not None}
+
+    def names(self, space: Space, first: int, count: int) -> frozenset[str]:
+        """The points that lie wholly in a block of `count` registers or coils, with a value or without."""
+        return self._forms.of(space, first, 2 * count).names
 
     def _scale(self, form: _Form, data: bytes, values: dict[str, Value], known: Mapping[str, Value]) -> None:
         """Rule 5; the points that tell the scaling are in `values` by now if this block holds them."""
@@ -137,14 +142,28 @@ class Decoder:
             else:
                 self.implausible += 1
 
-    def _form(self, space: Space, first: int, size: int) -> _Form:
+
+class _Forms:
+    """The forms of all blocks of devices that are read alike."""
+
+    def __init__(self, device_map: DeviceMap, readings: Mapping[str, str]) -> None:
+        self.map = device_map
+        self._points = _bind(device_map, dict(readings))
+        self.factors = frozenset(name for bound in self._points for name in bound.reading.factors)
+        self._kept: dict[tuple[Space, int, int], _Form] = {}
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def of(self, space: Space, first: int, size: int) -> _Form:
+        """The form of a block of `size` bytes of registers, or of twice as many bytes as coils."""
         key = (space, first, size)
-        form = self._forms.get(key)
+        form = self._kept.get(key)
         return self._remember(key) if form is None else form
 
     def _remember(self, key: tuple[Space, int, int]) -> _Form:
-        if len(self._forms) >= _MAX_FORMS:
-            self._forms.clear()
+        if len(self._kept) >= _MAX_FORMS:
+            self._kept.clear()
         space, first, size = key
         if size % 2:
             raise ValueError(f"{size} bytes are not whole registers")
@@ -168,9 +187,24 @@ class Decoder:
             _format(scaled, first, size, {1: "H", 2: "I"}),
             tuple((bound.point.name, _converter(bound), *bound.bounds, bound.reading.factors) for bound in scaled),
             tuple((bound.point.name, bound.slice_from(first), bound.reading) for bound in texts),
+            frozenset(bound.point.name for bound in inside),
         )
-        self._forms[key] = form
+        self._kept[key] = form
         return form
+
+
+_KINDS: dict[tuple[int, tuple[tuple[str, str], ...]], _Forms] = {}
+
+
+def _forms(device_map: DeviceMap, readings: Mapping[str, str]) -> _Forms:
+    """Those of a map and readings; the same ones for all who ask, for they depend on nothing else."""
+    key = (id(device_map), tuple(sorted(readings.items())))
+    known = _KINDS.get(key)
+    if known is None or known.map is not device_map:
+        if len(_KINDS) >= _MAX_KINDS:
+            _KINDS.clear()
+        known = _KINDS[key] = _Forms(device_map, readings)
+    return known
 
 
 def _bind(device_map: DeviceMap, readings: dict[str, str]) -> tuple[_Bound, ...]:
