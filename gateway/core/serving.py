@@ -41,10 +41,10 @@ CLIENT_BLOCKS = 8
 
 @dataclass(frozen=True, slots=True)
 class FromMemory:
-    """A reply PDU that is right while `snapshot` is the device's snapshot and the time is before `valid_until`."""
+    """A reply PDU that is right while the device's snapshot has this `mark` and the time is before `valid_until`."""
 
     reply: bytes
-    snapshot: Snapshot
+    mark: object
     valid_until: float
 
 
@@ -79,7 +79,7 @@ class Serving:
         if pdu[0] == READ_DEVICE_IDENTIFICATION:
             reply = identify(pdu, snapshot.identification if online else None)
             if reply is not None:
-                return FromMemory(reply, snapshot, math.inf)
+                return FromMemory(reply, snapshot.mark, math.inf)
             self._check_reachable(snapshot, now)
             return Ask(pdu, None, now)
         read = parse_read(pdu)
@@ -92,7 +92,7 @@ class Serving:
             block = self._youngest(snapshot, space, read.address, read.count)
             if block is not None and now < block.read_at + self._max_age_s:
                 reply = read_reply(block, read.function, read.address, read.count)
-                return FromMemory(reply, snapshot, block.read_at + self._max_age_s)
+                return FromMemory(reply, snapshot.mark, block.read_at + self._max_age_s)
         self._check_reachable(snapshot, now)
         return Ask(pdu, read, now)
 

@@ -1,6 +1,7 @@
 """Immutable values of one device with their times.
 
-A snapshot is replaced whole and never changed, so a face that holds one sees one consistent state.
+A snapshot is replaced whole and never changed, so a face that holds one sees one consistent state. Who only wants to
+know later whether the device still has it keeps its `mark`: whoever keeps the snapshot keeps all its values.
 All times are monotonic seconds. `Block.read_at` is when the request went out: the values are at
 most that old, never older than stated.
 """
@@ -64,6 +65,7 @@ class Snapshot:
     identification: Identification | None = None
     serial_number: str | None = None
     warnings: frozenset[str] = frozenset()  # conditions that the gateway itself sees
+    mark: object = field(default_factory=object, init=False, repr=False, compare=False)  # of this snapshot alone
 
     def shown(self) -> Mapping[str, Value]:
         """Values that a face may show now: all of an online device, none of any other."""

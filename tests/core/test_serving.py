@@ -40,7 +40,7 @@ def read(first: int, count: int, function: int = 3) -> bytes:
 def test_the_reply_says_until_when_it_is_right() -> None:
     serving = make(block(0, 16, NOW - 3))
     answer = serving.answer(read(4, 2), NOW)
-    assert answer == FromMemory(b"\x03\x04\x00\x04\x00\x05", serving.device.snapshot, NOW + 2)
+    assert answer == FromMemory(b"\x03\x04\x00\x04\x00\x05", serving.device.snapshot.mark, NOW + 2)
 
 
 @pytest.mark.parametrize(("age_s", "served"), [(0.0, True), (4.999, True), (5.0, False), (60.0, False)])
@@ -101,7 +101,7 @@ def test_what_a_client_read_is_known_for_max_age_from_the_question() -> None:
     serving = make()
     serving.learn(ask(serving, read(0xE000, 3)), b"\x03\x06abcdef")
     answer = serving.answer(read(0xE001, 1), NOW + 4.9)
-    assert answer == FromMemory(b"\x03\x02cd", serving.device.snapshot, NOW + 5)
+    assert answer == FromMemory(b"\x03\x02cd", serving.device.snapshot.mark, NOW + 5)
     ask(serving, read(0xE001, 1), NOW + 5)
 
 

@@ -122,11 +122,11 @@ class Connection(asyncio.Protocol):
             if self._direct:
                 entry = self._find(data[2:])
                 if entry is not None:
-                    valid_until, device, snapshot, reply = entry
+                    valid_until, device, mark, reply = entry
                     now = self._now()
                     client = self.client
                     left = client.left
-                    if left and now < valid_until and device.snapshot is snapshot:
+                    if left and now < valid_until and device.snapshot.mark is mark:
                         client.left = left - 1
                         self.seen = now
                         self._write(data[:2] + reply)
@@ -271,7 +271,7 @@ class Connection(asyncio.Protocol):
             most = min(MAX_BURST, client.left)
             while hits < most and at + READ_SIZE <= size:
                 entry = find(data[at + 2 : at + READ_SIZE])
-                if entry is None or now >= entry[0] or entry[1].snapshot is not entry[2]:
+                if entry is None or now >= entry[0] or entry[1].snapshot.mark is not entry[2]:
                     break
                 out.append(data[at : at + 2])
                 out.append(entry[3])

@@ -155,7 +155,7 @@ class Dispatcher:
         client.slow += 1
         request = mbap.encode(0, unit, pdu)[2:]
         entry = self.hot.find(request)
-        if entry is not None and now < entry[0] and entry[1].snapshot is entry[2]:
+        if entry is not None and now < entry[0] and entry[1].snapshot.mark is entry[2]:
             self.stats.cache_hits += 1
             return entry[3]
         try:

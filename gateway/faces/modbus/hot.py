@@ -12,10 +12,9 @@ from __future__ import annotations
 
 from gateway.core.serving import FromMemory
 from gateway.core.site import Device
-from gateway.core.snapshot import Snapshot
 
-Entry = tuple[float, Device, Snapshot, bytes]
-"""(monotonic time until which it is valid, device, the snapshot it was made from, reply); a bare tuple for speed."""
+Entry = tuple[float, Device, object, bytes]
+"""(monotonic time until which it is valid, device, mark of its snapshot then, reply); a bare tuple for speed."""
 
 CAPACITY = 4096
 
@@ -41,4 +40,4 @@ class HotReplies:
         """Keep `reply` for `request`; both without transaction id."""
         if len(self._entries) >= self._capacity and request not in self._entries:
             self._entries.clear()
-        self._entries[request] = (made.valid_until, device, made.snapshot, reply)
+        self._entries[request] = (made.valid_until, device, made.mark, reply)

@@ -48,7 +48,7 @@ class ErrorStatus(Enum):
 class _Nothing:
     """In the place of a device for replies that depend on none."""
 
-    snapshot: Snapshot | None = None
+    snapshot = Snapshot()
 
 
 _NOTHING = _Nothing()
@@ -64,9 +64,9 @@ class Answer:
     __slots__ = (
         "_device",
         "_devices",
+        "_marks",
         "_request",
         "_seen",
-        "_snapshots",
         "_spans",
         "_version",
         "_window",
@@ -94,13 +94,13 @@ class Answer:
         self._spans: list[tuple[int, int]] = []
         self._device: Device | _Nothing = _NOTHING
         self._devices: tuple[Device, ...] = ()
-        self._seen: Snapshot | None = None
-        self._snapshots: list[Snapshot] = []
+        self._seen = _NOTHING.snapshot.mark
+        self._marks: list[object] = []
 
     def holds(self) -> bool:
         """Whether every device still has the snapshot that it had."""
-        return self._device.snapshot is self._seen and (
-            not self._devices or [device.snapshot for device in self._devices] == self._snapshots
+        return self._device.snapshot.mark is self._seen and (
+            not self._devices or [device.snapshot.mark for device in self._devices] == self._marks
         )
 
     def read(self, counters: SnmpCounters, now: float) -> None:
@@ -153,12 +153,12 @@ class Answer:
             devices = reading.devices()
             self.lasting = devices is not None
             if not devices:
-                self._device, self._seen, self._devices = _NOTHING, None, ()
+                self._device, self._seen, self._devices = _NOTHING, _NOTHING.snapshot.mark, ()
                 return
             self._spans = reading.spans
             self._device, self._devices = devices[0], tuple(devices[1:])
-        self._seen = self._device.snapshot
-        self._snapshots = [device.snapshot for device in self._devices]
+        self._seen = self._device.snapshot.mark
+        self._marks = [device.snapshot.mark for device in self._devices]
 
     def _put(self, result: bytes) -> None:
         request_id = self._request.request_id

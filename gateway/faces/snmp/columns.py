@@ -110,9 +110,9 @@ class SnapshotColumn(Column):
         device = self.rows.devices[at]
         if device is None:
             return super().varbind(at, now)
-        snapshot = device.snapshot
+        mark = device.snapshot.mark
         try:
-            if self._seen[at] is snapshot:
+            if self._seen[at] is mark:
                 return self._varbinds[at]
         except IndexError:
             many = self.size
@@ -121,7 +121,7 @@ class SnapshotColumn(Column):
         if cell != self._cells[at] or self._varbinds[at] is None:
             self._cells[at] = cell
             self._varbinds[at] = self._encoded(at, cell)
-        self._seen[at] = snapshot
+        self._seen[at] = mark
         return self._varbinds[at]
 
     def first(self, at: int, now: float) -> tuple[int, bytes] | None:
