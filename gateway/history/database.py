@@ -26,6 +26,8 @@ FILE_NAME = "history.sqlite3"
 VERSION = 1
 APPLICATION_ID = 0x50534758  # "PSGX"
 BUSY_S = 5.0
+ASIDE = ".corrupt-"
+"""In the names of damaged files (rule 2); behind it is when that was found."""
 
 _log = logging.getLogger(__name__)
 
@@ -138,7 +140,7 @@ def set_aside(path: Path, why: str) -> Path:
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
     number = 0
     while True:
-        aside = path.with_name(f"{path.name}.corrupt-{stamp}" + (f"-{number}" if number else ""))
+        aside = path.with_name(f"{path.name}{ASIDE}{stamp}" + (f"-{number}" if number else ""))
         if not aside.exists():
             break
         number += 1

@@ -2,7 +2,7 @@
 
 Rule 1: a backup disturbs nobody and may be made while the gateway writes. Each file is in it as it was at one moment:
         databases by SQLite's own backup, ledgers up to their last whole line, the rest by one read, since those files
-        are only ever replaced whole.
+        are only ever replaced whole. What was set aside as damaged is never written again: it is copied as it is.
 Rule 2: nothing is restored below a gateway that runs (service/state_dir.py knows), and nothing of what was there is
         lost: it moves into a folder beside. An archive is checked whole before anything is moved.
 Rule 3: an SNMP engine never has a number of boots twice (RFC 3414 §2.2). A restored one goes on above every number
@@ -30,6 +30,7 @@ from typing import BinaryIO
 from gateway import __version__
 from gateway.errors import BackupError
 from gateway.faces.snmp import engine
+from gateway.history.database import ASIDE
 from gateway.service.state_dir import held
 
 FORMAT = 1
@@ -94,11 +95,13 @@ def _create(path: Path) -> BinaryIO:
 
 
 def _files(state_dir: Path) -> list[Path]:
-    """What is kept: plain files that are no one's working copy."""
+    """What is kept: plain files that are no one's working copy, and damaged ones with what belongs to them."""
     found = (path for path in state_dir.iterdir() if path.is_file() and not path.is_symlink())
-    return sorted(
-        path for path in found if not path.name.startswith(".") and not path.name.endswith((".new", *_BESIDE))
-    )
+    return sorted(path for path in found if not path.name.startswith(".") and not _is_working_copy(path.name))
+
+
+def _is_working_copy(name: str) -> bool:
+    return name.endswith(".new") or (name.endswith(_BESIDE) and ASIDE not in name)
 
 
 def _collect(state_dir: Path, folder: Path) -> tuple[str, ...]:
@@ -116,7 +119,7 @@ def _collect(state_dir: Path, folder: Path) -> tuple[str, ...]:
             for path, file in opened:
                 head = file.read(len(_DATABASE))
                 file.seek(0)
-                if head == _DATABASE:
+                if head == _DATABASE and ASIDE not in path.name:
                     _copy_database(path, folder / path.name)
                 else:
                     data = file.read()
@@ -132,8 +135,13 @@ def _copy_database(path: Path, copy: Path) -> None:
         closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=10.0)) as source,
         closing(sqlite3.connect(copy)) as target,
     ):
-        source.backup(target)
-        target.execute("PRAGMA journal_mode = DELETE")  # one file, nothing beside it
+        try:
+            source.backup(target)
+            target.execute("PRAGMA journal_mode = DELETE")  # one file, nothing beside it
+        except sqlite3.DatabaseError as error:
+            if error.sqlite_errorcode & 0xFF not in {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}:
+                raise
+            raise BackupError(f"{path}: {error}; start the gateway, which sets it aside, and try again") from error
     copy.chmod(0o600)
 
 
@@ -163,7 +171,7 @@ def _unpack(archive: Path, folder: Path) -> Manifest:
 
 def _check_database(path: Path, archive: Path) -> None:
     with path.open("rb") as file:
-        if file.read(len(_DATABASE)) != _DATABASE:
+        if ASIDE in path.name or file.read(len(_DATABASE)) != _DATABASE:
             return
     with closing(sqlite3.connect(path)) as connection:
         (found,) = connection.execute("PRAGMA quick_check(1)").fetchone()

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 
 from gateway.clock import Clock
 from gateway.core.conditions import Conditions, Watch
-from gateway.core.site import Site
+from gateway.core.site import LineState, Site
+from gateway.core.snapshot import DeviceState
 from gateway.core.stats import HistoryStats, ModbusServerStats, ServiceStats
 from gateway.errors import ConfigError, ListenError, TlsFilesError
 from gateway.faces.http.access import Access, tls_context
@@ -92,7 +93,7 @@ class Gateway:
         self._harvesting = self._harvester(config, self.site)
         self._others: tuple[Runnable, ...] = (Tracer(kept.directory, lambda: self.lines, clock),)
         if systemd is not None and systemd.watchdog_s is not None:
-            self._others += (Watchdog(systemd, systemd.watchdog_s, self.stuck),)
+            self._others += (Watchdog(systemd, systemd.watchdog_s, self.stuck, self.summary),)
         self.changing = asyncio.Lock()  # held from the plan of a change to its end
         self._models = ModelKeeper(lambda: self.site, self.show_models)
         self.supervisor = Supervisor(clock, south.lines, self.listeners, self.keepers)
@@ -153,9 +154,19 @@ class Gateway:
         )
 
     def summary(self) -> str:
-        """In a few words for people: is it ready?"""
+        """How things stand, in one line for people."""
+        now, devices, lines = self._clock.monotonic(), self.site.devices, self.site.lines
+        online = sum(device.snapshot.state is DeviceState.ONLINE for device in devices)
+        down = sum(line.status(now).state is LineState.DOWN for line in lines)
         closed = len(self.supervisor.down())
-        return f"{closed} listeners are not open" if closed else "serving"
+        said = [f"{online} of {len(devices)} controllers online"]
+        if down:
+            said.append(f"{down} of {len(lines)} lines down")
+        if closed:
+            said.append(f"{closed} of {len(self.listeners)} listeners not open")
+        if not self.stats.reload_works:
+            said.append("the configuration was refused, the one before it is in use")
+        return "; ".join(said)
 
     def stuck(self, most_s: float) -> tuple[str, ...]:
         """See `Supervisor.stuck`."""

@@ -34,9 +34,9 @@ class Systemd:
         """On its way out."""
         self._tell("STOPPING=1")
 
-    def alive(self) -> None:
-        """Feed the watchdog."""
-        self._tell("WATCHDOG=1")
+    def alive(self, status: str) -> None:
+        """Feed the watchdog; `status` is for people."""
+        self._tell(f"WATCHDOG=1\nSTATUS={status}")
 
     def _tell(self, text: str) -> None:
         if not self._address:

@@ -1,4 +1,4 @@
-"""Tells systemd that the gateway is alive, as long as it is.
+"""Tells systemd that the gateway is alive, as long as it is, and how things stand, for `systemctl status`.
 
 Rule 1: alive is more than that the loop turns: every task is there, and no line has had something to do for `LATE_S`
         without doing it.
@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 
 class Watchdog:
-    """The keeper that feeds systemd's watchdog; `stuck(most_s)` names what does not work."""
+    """The keeper that feeds systemd's watchdog; `stuck(most_s)` names what does not work, `summary` is for people."""
 
     name = "watchdog"
 
@@ -29,6 +29,7 @@ class Watchdog:
         systemd: Systemd,
         period_s: float,
         stuck: Callable[[float], tuple[str, ...]],
+        summary: Callable[[], str],
         *,
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> None:
@@ -36,6 +37,7 @@ class Watchdog:
         self._systemd = systemd
         self._pause_s = period_s / 4
         self._stuck = stuck
+        self._summary = summary
         self._sleep = sleep
 
     async def run(self) -> None:
@@ -49,7 +51,7 @@ class Watchdog:
                     _log.critical('event=watchdog_not_fed stuck="%s"', ", ".join(sorted(found)))
                 said = found
             else:
-                self._systemd.alive()
+                self._systemd.alive(self._summary())
                 said = frozenset()
             before = found
             await self._sleep(self._pause_s)

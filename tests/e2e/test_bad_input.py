@@ -17,11 +17,9 @@ from tests.e2e.programs import (
     DEMO_DEVICES,
     GATEWAY,
     Launch,
-    Running,
     Start,
     environment,
     wait_until,
-    write_config,
 )
 
 READ_RAM = bytes.fromhex("0000000000060103 0012 0005".replace(" ", ""))
@@ -81,40 +79,6 @@ def test_a_busy_port_is_named_with_its_holder(launch: Launch, start: Start, tmp_
         assert "in use by" in site.gateway.wait_for(r"line_down line=shelter-a")
         site.wait_online("array-3")
     site.wait_online()
-
-
-@pytest.mark.parametrize("face", ["modbus", "snmp", "http"])
-def test_a_taken_port_is_named_the_other_faces_go_on_and_it_is_retried(
-    start: Start, tmp_path: Path, face: str, free_tcp_port: Callable[[], int], free_udp_port: Callable[[], int]
-) -> None:
-    ports = {"modbus": free_tcp_port(), "snmp": free_udp_port(), "http": free_tcp_port()}
-    write_config(tmp_path / "site.toml", (ports["modbus"], ports["snmp"], ports["http"]))
-    kind = socket.SOCK_DGRAM if face == "snmp" else socket.SOCK_STREAM
-    with socket.socket(socket.AF_INET, kind) as holder:
-        holder.bind(("127.0.0.1", ports[face]))
-        if face != "snmp":
-            holder.listen()
-        gateway = start(*GATEWAY, "run", "-c", str(tmp_path / "site.toml"))
-        site = Running(tmp_path, ports["modbus"], ports["snmp"], ports["http"], gateway, None)
-        said = gateway.wait_for("event=listen_failed")
-        assert f'listener="{face} 127.0.0.1:{ports[face]}"' in said
-        if face != "modbus":
-            wait_until(lambda: can_connect(ports["modbus"]), "the Modbus face")
-            assert ask(ports["modbus"], 11) == b"\x83\x0a"
-        if face != "http":
-            wait_until(lambda: site.get("/readyz")[0], "the HTTP face")
-            assert site.get("/readyz") == (503, f"not ready\n{face} 127.0.0.1:{ports[face]} is not open\n")
-            assert site.get("/healthz")[0] == 200
-    gateway.wait_for(rf'event=listening listener="{face} .* after_s=')
-    wait_until(lambda: site.get("/readyz") == (200, "ready\n"), "readiness")
-    assert gateway.log().count("event=listen_failed") + gateway.seen.count("event=listen_failed") <= 1
-    assert gateway.end() == 0
-
-
-def can_connect(port: int) -> bool:
-    """Whether somebody listens."""
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 def test_a_silent_device_is_offline_and_the_others_are_served(launch: Launch) -> None:

@@ -20,7 +20,7 @@ from gateway.devices.model import Space
 from gateway.errors import BackupError
 from gateway.faces.modbus.ledger import NAME, LedgerFile, read_ledger
 from gateway.faces.snmp import engine
-from gateway.history.database import FILE_NAME, open_database, open_for_reading
+from gateway.history.database import FILE_NAME, open_database, open_for_reading, set_aside
 from gateway.service.backup import MANIFEST, back_up, restore
 from gateway.service.state_dir import claimed, held
 
@@ -299,3 +299,34 @@ def test_restored_files_belong_to_whom_the_folder_belongs(state: Path, tmp_path:
     restore(archive, new, LATER)
     restore(archive, new, LATER)  # and the folder of what was there before
     assert {(path.stat().st_uid, path.stat().st_gid) for path in new.iterdir()} == {(61234, 61234)}
+
+
+def damage(path: Path) -> bytes:
+    """Overwrite what is behind the head of a database, so that it still says that it is one; gives its content."""
+    path.write_bytes(path.read_bytes()[:100] + b"\xff" * 8192)
+    return path.read_bytes()
+
+
+def test_what_was_set_aside_as_damaged_is_kept_as_it_is(state: Path, tmp_path: Path) -> None:
+    """Its days may still be rescued, and one damaged file long ago is no reason to have no backup of the others."""
+    content = damage(state / FILE_NAME)
+    aside = set_aside(state / FILE_NAME, "a test")
+    aside.with_name(aside.name + "-wal").write_bytes(b"what was not yet in it")
+    with closing(open_database(state)) as connection:
+        add_controller(connection, 1)
+    archive = tmp_path / "backup.tar"
+    back_up(state, "ridge-07", archive, MADE)
+    assert members(archive)[aside.name] == content
+    assert {path.name for path in state.iterdir()} >= {aside.name, f"{aside.name}-wal"}
+    assert not aside.with_name(aside.name + "-shm").exists()  # it was not opened
+    restore(archive, tmp_path / "new", LATER)
+    assert history(tmp_path / "new") == (1, 1)
+    assert (tmp_path / "new" / aside.name).read_bytes() == content
+    assert (tmp_path / "new" / f"{aside.name}-wal").read_bytes() == b"what was not yet in it"
+
+
+def test_a_history_that_is_damaged_now_is_named_with_what_to_do(state: Path, tmp_path: Path) -> None:
+    damage(state / FILE_NAME)
+    with pytest.raises(BackupError, match=rf"{state / FILE_NAME}: .*start the gateway, which sets it aside"):
+        back_up(state, "ridge-07", tmp_path / "backup.tar", MADE)
+    assert not (tmp_path / "backup.tar").exists()

@@ -70,7 +70,7 @@ def test_every_row_has_a_test() -> None:
             serial.LAST_RETRY_S,
         ),
         (
-            'tried again, at most about {} s apart ([test](../tests/e2e/test_bad_input.py "test_a_taken',
+            'tried again, at most about {} s apart ([test](../tests/faults/service/test_f79_listeners.py "test_a_taken',
             supervisor.LAST_DELAY_S,
         ),
         ("answered for up to {} s", STOP_GRACE_S),

@@ -28,10 +28,15 @@ def test_every_message_arrives_in_the_words_of_sd_notify(listening: tuple[str, s
     systemd = Systemd({"NOTIFY_SOCKET": name})
     systemd.ready("serving")
     systemd.reloading(12.5)
-    systemd.alive()
+    systemd.alive("serving still")
     systemd.stopping()
     told = [receiver.recv(4096).decode() for _ in range(4)]
-    assert told == ["READY=1\nSTATUS=serving", "RELOADING=1\nMONOTONIC_USEC=12500000", "WATCHDOG=1", "STOPPING=1"]
+    assert told == [
+        "READY=1\nSTATUS=serving",
+        "RELOADING=1\nMONOTONIC_USEC=12500000",
+        "WATCHDOG=1\nSTATUS=serving still",
+        "STOPPING=1",
+    ]
 
 
 def test_without_systemd_nothing_is_sent_and_nothing_watched() -> None:
@@ -41,12 +46,12 @@ def test_without_systemd_nothing_is_sent_and_nothing_watched() -> None:
 
 
 def test_a_manager_that_is_gone_or_reads_nothing_disturbs_nobody(tmp_path: Path) -> None:
-    Systemd({"NOTIFY_SOCKET": str(tmp_path / "gone")}).alive()
+    Systemd({"NOTIFY_SOCKET": str(tmp_path / "gone")}).alive("")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
         receiver.bind(str(tmp_path / "slow"))
         systemd = Systemd({"NOTIFY_SOCKET": str(tmp_path / "slow")})
         for _ in range(5000):
-            systemd.alive()
+            systemd.alive("")
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ class Looks:
     async def sleep(self, seconds: float) -> None:
         self.pauses.add(seconds)
         try:
-            self.fed.append(self.receiver.recv(100) == b"WATCHDOG=1")
+            self.fed.append(self.receiver.recv(100) == b"WATCHDOG=1\nSTATUS=1 of 1 controllers online")
         except BlockingIOError:
             self.fed.append(False)
 
@@ -51,7 +51,7 @@ async def look(receiver: socket.socket, tmp_path: Path, *found: tuple[str, ...])
     looks = Looks(list(found), receiver)
     systemd = Systemd({"NOTIFY_SOCKET": str(tmp_path / "notify")})
     with pytest.raises(asyncio.CancelledError):
-        await Watchdog(systemd, PERIOD_S, looks.stuck, sleep=looks.sleep).run()
+        await Watchdog(systemd, PERIOD_S, looks.stuck, lambda: "1 of 1 controllers online", sleep=looks.sleep).run()
     return looks
 
 

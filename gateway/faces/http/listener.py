@@ -7,12 +7,12 @@ With TLS a connection counts from the end of its handshake; as many more may be 
 from __future__ import annotations
 
 import asyncio
-import os
 import ssl
 from collections.abc import Callable
 
 from gateway.clock import Clock
 from gateway.errors import ListenError
+from gateway.faces.binding import bind_problem
 from gateway.faces.http.access import load_certificate, tls_context
 from gateway.faces.http.connection import Connections
 from gateway.faces.http.handshakes import Handshakes
@@ -78,8 +78,7 @@ class HttpListener:
                 self._handshakes.open(self._host, self._port)
         except OSError as error:
             await self.stop()
-            reason = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror
-            raise ListenError(f"{self.label}: {reason or error}") from error
+            raise ListenError(f"{self.label}: {bind_problem(error)}") from error
         except asyncio.CancelledError:
             await self.stop()
             raise

@@ -28,13 +28,14 @@ from gateway.core.site import Site
 from gateway.core.stats import ModbusServerStats, TlsStats
 from gateway.core.status_registers import StatusRegisters
 from gateway.errors import ListenError, TlsFilesError
+from gateway.faces.binding import bind_problem
 from gateway.faces.modbus.accepting import Acceptor, listening_socket
 from gateway.faces.modbus.admission import decide, rate_of
 from gateway.faces.modbus.connection import Connection
 from gateway.faces.modbus.dispatch import Dispatcher, Routes, Shared
 from gateway.faces.modbus.settings import ModbusSettings, TlsSettings
 from gateway.faces.modbus.sockets import Hub, SocketTransport
-from gateway.faces.modbus.tcp import allowed, bind_problem
+from gateway.faces.modbus.tcp import allowed
 from gateway.faces.modbus.writer import Writer
 
 if TYPE_CHECKING:  # 9 MiB that only sites with TLS pay

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import socket
 from asyncio import BaseTransport
 from collections.abc import Sequence
@@ -15,13 +14,6 @@ KEEPALIVE_IDLE_S = 30
 KEEPALIVE_INTERVAL_S = 10
 KEEPALIVE_PROBES = 3
 USER_TIMEOUT_MS = 20_000
-
-_REASONS = {
-    errno.EADDRINUSE: "another program listens there",
-    errno.EACCES: "not permitted: a port below 1024 needs CAP_NET_BIND_SERVICE",
-    errno.EADDRNOTAVAIL: "this machine has no such address",
-    errno.EAFNOSUPPORT: "this machine does not speak that address family",
-}
 
 
 def client_name(peername: tuple[str, int] | tuple[str, int, int, int] | None) -> str:
@@ -65,10 +57,3 @@ def keep_alive(transport: BaseTransport) -> None:
         ):
             if hasattr(socket, option):  # not every system has them
                 sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
-
-
-def bind_problem(error: OSError) -> str:
-    """Why an address cannot be listened on, in words."""
-    if isinstance(error, socket.gaierror):
-        return "the name does not resolve to an address"
-    return _REASONS.get(error.errno or 0, error.strerror or str(error))

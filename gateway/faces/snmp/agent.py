@@ -20,6 +20,7 @@ from gateway.core.conditions import Conditions
 from gateway.core.site import Site
 from gateway.core.stats import ModbusServerStats
 from gateway.errors import ListenError
+from gateway.faces.binding import bind_problem
 from gateway.faces.snmp import entity, standard
 from gateway.faces.snmp.client_rows import ClientRows
 from gateway.faces.snmp.counters import SnmpCounters
@@ -284,7 +285,7 @@ class SnmpListener:
         except OSError as error:
             if sock is not None:
                 sock.close()
-            raise ListenError(f"{self.label} (UDP): {error.strerror or error}") from error
+            raise ListenError(f"{self.label} (UDP): {bind_problem(error)}") from error
         self._socket = sock
         loop.add_reader(sock, self._agent.answer_waiting, sock, self._context)
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import errno
 from ipaddress import ip_network
 
 import pytest
 
 from gateway.faces.modbus.settings import LOOPBACK
-from gateway.faces.modbus.tcp import allowed, bind_problem, client_name
+from gateway.faces.modbus.tcp import allowed, client_name
 
 
 @pytest.mark.parametrize(
@@ -49,13 +48,3 @@ def test_an_address_with_a_scope() -> None:
 
 def test_nobody_is_allowed_by_nothing() -> None:
     assert not allowed("127.0.0.1", ())
-
-
-@pytest.mark.parametrize("number", [errno.EADDRINUSE, errno.EACCES, errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT])
-def test_a_bind_problem_is_told_in_words(number: int) -> None:
-    assert "Errno" not in bind_problem(OSError(number, "x"))
-    assert len(bind_problem(OSError(number, "x"))) > 10
-
-
-def test_another_bind_problem_is_told_as_the_system_does() -> None:
-    assert bind_problem(OSError(errno.EMFILE, "Too many open files")) == "Too many open files"

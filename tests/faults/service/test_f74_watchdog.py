@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import signal
 
 from tests.faults.service.rig import QUIET, NotifySocket, Service
@@ -12,7 +13,7 @@ async def test_ready_alive_stopping(service: Service, systemd: NotifySocket) -> 
     service.configure()
     program = service.start(NOTIFY_SOCKET=systemd.path, WATCHDOG_USEC="400000")
     ready = await systemd.next("READY=1")
-    assert ready == "READY=1\nSTATUS=serving"
+    assert re.fullmatch(r"READY=1\nSTATUS=[01] of 1 controllers online(; 1 of 1 lines down)?", ready)
     assert (await service.get("/readyz"))[0] == 200  # it is true when it is said
     loop = asyncio.get_running_loop()
     began = loop.time()
@@ -37,8 +38,11 @@ async def test_an_unplugged_line_and_a_dead_controller_do_not_starve_it(
     await service.log("device_offline .*device=ghost")
     service.lines["shelter-a"].unplug()
     await service.log("line_down line=shelter-a")
+    told = ""
     for _ in range(12):
-        await systemd.next("WATCHDOG=1")
+        told = await systemd.next("WATCHDOG=1")
+    # And whoever looks at `systemctl status` sees it: the third controller's line is not there at all.
+    assert told == "WATCHDOG=1\nSTATUS=0 of 3 controllers online; 2 of 2 lines down"
     assert (await service.get("/healthz"))[0] == 200
     assert (await service.get("/readyz"))[0] == 200
 
