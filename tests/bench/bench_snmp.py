@@ -38,7 +38,7 @@ from gateway.faces.snmp.objects import RowKind
 from gateway.faces.snmp.settings import Oid
 from gateway.faces.snmp.usm import LocalUser
 from tests.bench.bench_modbus_tcp import HERE, compiled, cpu_s, free_port, say, where
-from tests.bench.snmp_server import BENCH, UNITS
+from tests.bench.snmp_server import BENCH, MODEL, UNITS
 
 COLUMNS = 80
 REPETITIONS = 50
@@ -182,12 +182,12 @@ class Asker:
 
 
 def gateway_cells() -> tuple[Oid, ...]:
-    """The first 80 columns of points, 200 rows, in order."""
+    """The first 80 columns of points that the devices have, 200 rows, in order."""
     columns = [
         (*table.base, 1, column.number)
         for table in shipped_layout().tables
         for column in table.columns
-        if table.rows is RowKind.DEVICE and column.point is not None
+        if table.rows is RowKind.DEVICE and column.point is not None and column.models and MODEL in column.models
     ]
     return tuple((*column, unit) for column in sorted(columns)[:COLUMNS] for unit in range(1, UNITS + 1))
 

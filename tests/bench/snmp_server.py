@@ -10,6 +10,7 @@ since the last SIGUSR1.
 from __future__ import annotations
 
 import asyncio
+import logging
 import signal
 import socket
 import sys
@@ -34,6 +35,7 @@ from gateway.service.garbage import set_aside
 from tests.bench.gateway_server import NoLine
 
 UNITS = 200
+MODEL = "prostar-mppt"
 POLL_S = 1.0
 DECODED = 100
 LOOPBACK = (ip_network("127.0.0.0/8"),)
@@ -75,7 +77,7 @@ class Turns:
 async def serve(port: int, modbus_port: int) -> None:
     clock = SystemClock()
     line = NoLine()
-    device_map = load_map("prostar-mppt")
+    device_map = load_map(MODEL)
     devices = [Device(f"unit-{unit}", unit, unit, device_map) for unit in range(1, UNITS + 1)]
     for device in devices:
         device.line = line
@@ -118,6 +120,7 @@ async def serve(port: int, modbus_port: int) -> None:
 
 
 if __name__ == "__main__":
+    logging.basicConfig(level=logging.ERROR)  # that a poller signs in would be told amid the tables
     if sys.argv[3] == "uvloop":
         import uvloop
 

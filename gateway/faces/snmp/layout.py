@@ -18,15 +18,15 @@ over all models; a disagreement about number, syntax, scale, units or labels is 
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from gateway.devices.agreement import all_maps
-from gateway.devices.model import Bit, DeviceMap, EnumValue, Group, Point
+from gateway.devices.model import Bit, DeviceMap, EnumValue, Group, Point, Value
 from gateway.errors import MapError
 from gateway.faces.snmp import client_table, condition_tables, log_columns, notifications, tables
+from gateway.faces.snmp.encodings import Encodings, of_bits, of_numbers
 from gateway.faces.snmp.objects import (
     CellValue,
     Changes,
@@ -37,7 +37,6 @@ from gateway.faces.snmp.objects import (
     ScalarGroup,
     Syntax,
     Table,
-    in_range,
     text,
 )
 from gateway.faces.snmp.settings import DEFAULT_ROOT, Oid
@@ -285,17 +284,17 @@ class _Columns:
         except ValueError:
             raise MapError(f"{where}: syntax {point.mib.syntax!r} is not known") from None
         convention = None
-        get: Callable[[DeviceRow, float], CellValue]
+        encodings: Encodings | None
         if syntax is Syntax.BITS:
             convention = self.convention(point.bits, where)
-            get = _bits_getter(point.name, point.words)
+            encodings = of_bits(point.words)
         elif syntax is Syntax.ENUMERATION:
             convention = self.convention(point.enumeration, where)
-            get = _number_getter(point.name, 1, syntax)
+            encodings = of_numbers(syntax, 1)
         elif syntax is Syntax.TEXT:
-            get = _text_getter(point.name)
+            encodings = None
         elif syntax in {Syntax.INTEGER32, Syntax.UNSIGNED32}:
-            get = _number_getter(point.name, point.mib.scale, syntax)
+            encodings = of_numbers(syntax, point.mib.scale)
         else:
             raise MapError(f"{where}: syntax {syntax} is not for points")
         return ObjectType(
@@ -303,12 +302,13 @@ class _Columns:
             column_name(point),
             syntax,
             point.help,
-            get,
+            _text_getter(point.name) if encodings is None else _number_getter(point.name, encodings.cell),
             units=point.mib.units,
             convention=convention,
             changes=Changes.WITH_SNAPSHOT,
             models=frozenset({device_map.model}),
             point=point.name,
+            encodings=encodings,
         )
 
     def convention(self, key: str | None, where: str) -> Convention:
@@ -359,13 +359,10 @@ def _labels(known: Mapping[int, tuple[str, str]], syntax: Syntax) -> tuple[tuple
     return tuple((number, named[number]) for number in sorted(named))
 
 
-def _number_getter(point: str, scale: int, syntax: Syntax) -> Callable[[DeviceRow, float], CellValue]:
+def _number_getter(point: str, cell: Callable[[Value], CellValue]) -> Callable[[DeviceRow, float], CellValue]:
     def get(row: DeviceRow, _now: float) -> CellValue:
         value = row.device.snapshot.shown().get(point)
-        if value is None or not math.isfinite(scaled := value * scale):
-            return None
-        number = round(scaled)
-        return number if in_range(syntax, number) else None
+        return None if value is None else cell(value)
 
     return get
 
@@ -374,18 +371,5 @@ def _text_getter(point: str) -> Callable[[DeviceRow, float], CellValue]:
     def get(row: DeviceRow, _now: float) -> CellValue:
         value = row.device.snapshot.shown_texts().get(point)
         return None if value is None else text(value)
-
-    return get
-
-
-def _bits_getter(point: str, words: int) -> Callable[[DeviceRow, float], CellValue]:
-    size = 16 * words
-
-    def get(row: DeviceRow, _now: float) -> CellValue:
-        value = row.device.snapshot.shown().get(point)
-        if value is None or not 0 <= value < 1 << size:
-            return None
-        # RFC 2578 §7.1.4: bit 0 is the most significant bit of the first octet.
-        return int(f"{int(value):0{size}b}"[::-1], 2).to_bytes(2 * words, "big")
 
     return get

@@ -19,7 +19,7 @@ from typing import Any
 from gateway.core.conditions import Conditions, DeviceConditions, Watch
 from gateway.core.site import Device, LinePort, Site
 from gateway.core.stats import ModbusServerStats
-from gateway.devices.model import Point
+from gateway.devices.model import Point, Value
 from gateway.faces.snmp.client_rows import ClientRows
 from gateway.faces.snmp.counters import SnmpCounters
 from gateway.faces.snmp.settings import Oid
@@ -166,6 +166,7 @@ class ObjectType:
     models: frozenset[str] | None = None
     point: str | None = None  # the map's point; without a shown value of it there is no cell
     only: Callable[[Any], bool] | None = None
+    encodings: Mapping[Value, bytes] | None = field(default=None, compare=False, repr=False)  # of a point: by its value
     of_values: bool = False  # like `point`, of the row's: a device that shows no values has no cell here
 
 

@@ -5,31 +5,41 @@ of one name with NULL. Rules:
 
 1. A beginning is known when a request with it was read whole and answered. It fixes version, community or scope, kind
    and, by its lengths, the size of the tail; and so every octet of the tail but those of the name.
-2. All these octets are compared, and the name has to be that of a cell of the window, so what is answered here is as
-   well-formed as what was read whole.
-3. Nothing of the reply is kept: the varbind is the cell's own, as it is now. Whatever is not a plain value (end of the
-   view, no such instance) is left to the long way.
-4. Beginnings are few, and bounded by MOST_BEGINNINGS.
+2. All these octets are compared, and a name that is not that of a cell of the window is read octet by octet, so what is
+   answered here is as well-formed as what was read whole.
+3. Nothing of the reply is kept: it is read as the long way would, as it is now. What is an error is left to the long
+   way.
+4. Cells of points that are numbers, nearly all that is asked for, are read in a shorter way (`routes.py`): a look-up
+   each of the column, the row, the number in the device's snapshot, and its octets. Where one of them finds nothing,
+   the cell is read as any other.
+5. Beginnings are few, and bounded by MOST_BEGINNINGS.
 """
 
 from __future__ import annotations
 
+from gateway.core.snapshot import DeviceState
 from gateway.faces.snmp import reader, wire
-from gateway.faces.snmp.reader import Request
+from gateway.faces.snmp.reader import NotSnmp, Request
+from gateway.faces.snmp.reading import Reading
 from gateway.faces.snmp.tree import Window
 
 MOST_BEGINNINGS = 512
 MOST_TAIL = 0x87
 """Octets of a tail whose lengths still take one octet each."""
+MOST_NUMBER = 16
+"""Octets of an encoded number, its identifier and length among them, are fewer."""
 
 _RESULT = b"\x02\x01\x00\x02\x01\x00"
 _NULL = b"\x05\x00"
+_ONLINE = DeviceState.ONLINE
 
 
 class Single:
     """A known beginning; `head` is what stands before the PDU in a message with a community, None for a bare PDU."""
 
-    __slots__ = ("_envelopes", "_frame", "_head", "_id_size", "_next", "_size", "grant", "room", "window")
+    __slots__ = (
+        "_ahead", "_envelopes", "_frame", "_head", "_id_size", "_routes", "_size", "_split", "grant", "room", "window",
+    )  # fmt: skip
 
     def __init__(
         self, window: Window, request: Request, size: int, *, room: int, head: bytes | None, grant: object
@@ -40,42 +50,61 @@ class Single:
         self._size = size  # of the tail
         self._frame = _RESULT + wire.head(0x30, size - 8) + wire.head(0x30, size - 10) + wire.head(0x06, size - 14)
         self._head = head
-        self._next = request.kind == reader.GET_NEXT
+        self._ahead = int(request.kind == reader.GET_NEXT)
         self._id_size = len(request.request_id) - 2
-        self._envelopes: dict[int, tuple[bytes, bytes]] = {}  # by the size of the varbind
+        self._routes = window.routes.of(self._frame, self._ahead)
+        self._split = len(self._frame) + window.routes.prefix_size  # where the index begins in the tail
+        self._envelopes: dict[int, tuple[bytes, bytes]] = {}  # by the size of the value
 
     def reply(self, data: bytes, at: int, now: float) -> bytes | None:
         """The reply to a request whose request id begins at `at`, None when it takes the long way."""
-        window = self.window
+        tail = at + self._id_size
+        index = tail + self._split
+        try:
+            rows, point, encodings, name = self._routes[data[tail:index]]
+            device, suffix = rows[data[index:]]
+            snapshot = device.snapshot
+            if snapshot.state is _ONLINE:
+                value = encodings[snapshot.values[point]]
+                before, behind = self._envelopes[len(value)]
+                return before + data[at:tail] + behind + name + suffix + value
+        except KeyError:
+            pass
+        return self._any(data, at, now)
+
+    def _any(self, data: bytes, at: int, now: float) -> bytes | None:
+        """The same for whatever is asked."""
         tail = at + self._id_size
         if len(data) != tail + self._size or not data.startswith(self._frame, tail) or not data.endswith(_NULL):
             return None
-        place = window.find(data[tail + 12 : -2])
-        if place is None:
+        name = data[tail + len(self._frame) - 2 : -2]
+        window = self.window
+        window.refresh()
+        reading = Reading(window, now)
+        try:
+            varbind, _ = reading.next(name) if self._ahead else reading.get(name)
+        except NotSnmp:
             return None
-        number, position = place
-        column = window.columns[number]
-        if self._next:
-            position += 1
-            varbind = column.varbind(position, now) if position < column.size else None
-            if varbind is None:
-                window.refresh()
-                found = window.from_place(window.starts[number] + position, now)
-                varbind = found[1] if found is not None else None
-        else:
-            varbind = column.varbind(position, now)
-        if varbind is None:
+        if len(varbind) > self.room:
             return None
-        envelope = self._envelopes.get(len(varbind))
-        if envelope is None:
-            if len(varbind) > self.room:
-                return None
-            envelope = self._envelopes[len(varbind)] = self._enveloped(len(varbind))
-        return envelope[0] + data[at:tail] + envelope[1] + varbind
+        first = reader.content(varbind, 0, len(varbind), 0x30)[0]
+        name_end = reader.content(varbind, first, len(varbind), 0x06)[1]
+        value_size = len(varbind) - name_end
+        before, behind = self._enveloped(value_size, name_end - first)
+        if value_size <= MOST_NUMBER and name_end - first == len(name):
+            self._envelopes[value_size] = before, behind
+            if data[tail : tail + self._split] not in self._routes:
+                found = window.find(name[2:])
+                if found is not None:
+                    column = window.columns[found[0]]
+                    window.routes.learn(self._frame, self._ahead, column, len(name) - 2 - len(column.prefix))
+        return before + data[at:tail] + behind + varbind[first:]
 
-    def _enveloped(self, size: int) -> tuple[bytes, bytes]:
-        """What stands before and behind the octets of the request id, before a varbind of this size."""
-        behind = _RESULT + wire.head(0x30, size)
+    def _enveloped(self, value_size: int, name_size: int) -> tuple[bytes, bytes]:
+        """What stands before and behind the octets of the request id, up to the name."""
+        size = value_size + name_size
+        behind = wire.head(0x30, size)
+        behind = _RESULT + wire.head(0x30, len(behind) + size) + behind
         before = wire.head(0x02, self._id_size)
         before = wire.head(wire.RESPONSE, len(before) + self._id_size + len(behind) + size) + before
         if self._head is not None:

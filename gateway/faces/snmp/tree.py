@@ -36,6 +36,7 @@ from gateway.faces.snmp.objects import (
     ScalarGroup,
     Table,
 )
+from gateway.faces.snmp.routes import Routes
 from gateway.faces.snmp.settings import Oid, View
 from gateway.faces.snmp.tails import Tail, Tails
 
@@ -71,6 +72,7 @@ class Window:
         for column in columns:
             cells[len(column.prefix)] += column.size
         self._sizes = [size for size, _ in cells.most_common()]
+        self.routes = Routes(columns)
         self._objects = objects
         self._depths = sorted({len(oid) for oid in objects})
         self._devices = devices

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from pyasn1.codec.ber import encoder
 from pysnmp.proto import rfc1902, rfc1905
 from pysnmp.proto.api import v2c
 
+from gateway.faces.snmp.columns import Cell
 from gateway.faces.snmp.objects import CellValue, Syntax
 from gateway.faces.snmp.settings import Oid, View
-from gateway.faces.snmp.tree import Tree
 
 TYPES = {
     Syntax.INTEGER32: rfc1902.Integer32,
@@ -34,7 +34,7 @@ Pairs = list[tuple[Oid, bytes]]
 class Oracle:
     """The cells of `tree` that `view` shows, as they are at `now`."""
 
-    def __init__(self, tree: Tree, view: View, now: float) -> None:
+    def __init__(self, tree: Iterable[Cell], view: View, now: float) -> None:
         shown = [cell for cell in tree if view.shows(cell.oid)]
         found = [(cell.oid, cell.object.syntax, cell.object.get(cell.row, now)) for cell in shown]
         self._cells = {oid: (syntax, value) for oid, syntax, value in found if value is not None}
