@@ -13,7 +13,8 @@ MAKEFLAGS += --no-builtin-rules --no-print-directory
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet --quiet
-JOBS := 2
+# More than two cores have: half of what the tests do is to wait for programs and ports.
+JOBS := 3
 # A Python 3.11 or newer; `make PYTHON=/path/to/python3.12 test` chooses another.
 PYTHON ?=
 
@@ -36,7 +37,7 @@ test: setup lint ## Set everything up, lint, and run the tests.
 
 .PHONY: test-long
 test-long: setup ## Run the long tiers: whole days, chaos, churn, restarts, installation; SOAK_S=3600 makes chaos an hour.
-	@$(BIN)/python -m pytest -m long -n $(JOBS) --timeout=3600
+	@$(BIN)/python -m pytest -m long -n 2 --timeout=3600
 
 .PHONY: test-newest
 test-newest: setup ## Run what depends on libraries with the newest versions that pyproject.toml allows.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ipaddress
 from collections.abc import Iterator, Mapping, Sequence
+from importlib.util import find_spec
 
 from gateway.devices.agreement import all_maps
 from gateway.devices.model import DeviceMap
@@ -50,6 +51,7 @@ def cross_problems(raw: Raw) -> list[Problem]:
     problems += _repeated(((*path, "name"), table.get("name")) for path, table in users)
     problems += _repeated(((*path, "name"), table.get("name")) for path, table in views)
     problems += snmp_problems(users, communities, views)
+    problems += _encryption(raw, users)
     emc1 = list(_tables(snmp, "emc1", ("snmp",)))
     problems += _repeated(((*path, "unit_id"), table.get("unit_id")) for path, table in emc1)
     problems += emc1_problems(emc1, devices)
@@ -85,6 +87,17 @@ def _repeated(values: Iterator[tuple[Path, object]], *, secret: bool = False) ->
             yield Problem(path, f"{shown} is already used by {render_path(seen[value])}; allowed: a value of its own")
         else:
             seen[value] = path
+
+
+def _encryption(raw: Raw, users: Sequence[tuple[Path, Raw]]) -> Iterator[Problem]:
+    """What only the library can do that may not be there; it is looked for, and not loaded."""
+    wanted: list[Path] = [path for path, _ in users[:1]]
+    if isinstance(_table(raw, "modbus").get("tls"), Mapping):
+        wanted.append(("modbus", "tls"))
+    if wanted and find_spec("cryptography") is None:
+        for path in wanted:
+            text = "needs the Python package cryptography, which is not installed; allowed: install it, or leave this"
+            yield Problem(path, text)
 
 
 def _upstream(path: Path, line: Raw) -> Iterator[Problem]:

@@ -116,6 +116,24 @@ def test_check_config_exits_78_for_a_short_pass_phrase(folder: Path, capsys: pyt
     assert "hunter2" not in said.out + said.err
 
 
+@pytest.mark.parametrize(
+    ("key", "table"),
+    [("snmp.user[0]", "[[snmp.user]]"), ("modbus.tls", "[modbus.tls]")],
+)
+def test_without_the_library_that_encrypts_it_is_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], key: str, table: str
+) -> None:
+    text = user(folder)
+    if table not in text:
+        files = "".join(f'{name}_file = "{folder}/none"\n' for name in ("certificate", "key", "client_ca"))
+        text = f"{text.partition('[[snmp')[0]}{table}\n{files}"
+    (folder / "c.toml").write_text(text)
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    for command in ("check-config", "run"):
+        assert run(command, "-c", str(folder / "c.toml")) == 78
+        assert f"{key}: needs the Python package cryptography, which is not installed" in capsys.readouterr().err
+
+
 def test_a_missing_pass_phrase_is_advice_when_checked_and_stops_the_start(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
