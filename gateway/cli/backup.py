@@ -9,7 +9,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from gateway.cli.config_file import ConfigOption, load_or_exit
+from gateway.cli.config_file import ConfigOption, load_or_exit, part_or_exit
 from gateway.clock import SystemClock
 from gateway.errors import BackupError
 from gateway.service.backup import back_up, restore
@@ -19,7 +19,7 @@ Archive = Annotated[Path, typer.Argument(metavar="ARCHIVE", help="The tar archiv
 
 def backup_command(archive: Archive, config: ConfigOption) -> None:
     """Write the configuration's state_dir to an archive, also while the gateway runs."""
-    checked = load_or_exit(config)
+    checked = part_or_exit(config, "site", "state_dir")
     try:
         names = back_up(Path(checked.state_dir), checked.site, archive, SystemClock().wall())
     except BackupError as error:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Annotated
 
+import typer
 from rich import box
 from rich.console import Console
 from rich.markup import escape
@@ -15,16 +17,23 @@ from gateway.core.budget import LineBudget
 from gateway.service.advice import advice
 from gateway.service.config import Config
 from gateway.service.settings import line_budgets, line_settings
-from gateway.service.snmp import snmp_on
+from gateway.service.snmp import snmp_on, unreadable
 from gateway.service.tls import tls_problems
 
 
-def command(config: ConfigOption) -> None:
+def command(
+    config: ConfigOption,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="Print problems only; secrets that cannot be read here are some.")
+    ] = False,
+) -> None:
     """Check a configuration: exit status 0 and a projection of its lines, or 78 and every problem."""
     checked = load_or_exit(config)
-    problems = tls_problems(checked, SystemClock().wall())
+    problems = [*tls_problems(checked, SystemClock().wall()), *(unreadable(checked) if quiet else ())]
     if problems:
         refuse(config, [f"{config}: {problem}" for problem in problems])
+    if quiet:
+        return
     budgets = line_budgets(checked)
     console = Console()
     console.print(_lines(checked, budgets), _devices(checked, budgets), sep="\n")

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from gateway.cli.config_file import ConfigOption, load_or_exit
+from gateway.cli.config_file import ConfigOption, part_or_exit
 from gateway.errors import ListenError
 from gateway.faces.http.access import read_passwords, read_token
 from gateway.faces.http.clients import PATH
@@ -39,7 +39,7 @@ def command(
     as_json: Annotated[bool, typer.Option("--json", help="Print what the gateway says as it is.")] = False,
 ) -> None:
     """Show who asks the running gateway by Modbus TCP, how often, and what was answered from memory."""
-    http = load_or_exit(config).http
+    http = part_or_exit(config, "http").http
     if not http.listen:
         print(f"{config}: http.listen is empty, so the gateway cannot be asked", file=sys.stderr)
         raise typer.Exit(1)

@@ -19,7 +19,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from gateway.cli.config_file import ConfigOption, load_or_exit
+from gateway.cli.config_file import ConfigOption, part_or_exit
 from gateway.cli.stopping import Stop
 from gateway.modbus.recording import Piece, Recording
 from gateway.service.tracing import FILE_NAME
@@ -112,7 +112,7 @@ async def _replay(port: PtyLine, recording: Recording, requests: int) -> None:
 def _watch(config: Path, line: str, seconds: float) -> Iterator[str]:
     """The lines of a recording that is being made, the first of them what it is of; _Failed with the reason."""
     stop = Stop(_SIGNALS)
-    path = Path(load_or_exit(config).state_dir) / FILE_NAME
+    path = Path(part_or_exit(config, "state_dir").state_dir) / FILE_NAME
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
         sock.settimeout(CONNECT_S)
         try:

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from gateway.cli.config_file import ConfigOption, load_or_exit
+from gateway.cli.config_file import ConfigOption, part_or_exit
 from gateway.core.write_ledger import Entry, entries
 from gateway.devices.model import Space
 from gateway.faces.modbus.ledger import read_ledger
@@ -28,7 +28,7 @@ def command(
     as_json: Annotated[bool, typer.Option("--json", help="One line of JSON a write instead of a table.")] = False,
 ) -> None:
     """Show the write ledger in the configuration's state_dir; it may be read while the gateway runs."""
-    folder = Path(load_or_exit(config).state_dir)
+    folder = Path(part_or_exit(config, "state_dir").state_dir)
     try:
         found = entries(read_ledger(folder))
     except OSError as error:

@@ -10,7 +10,10 @@ from pathlib import Path
 
 import pytest
 
-FOLDER = Path(__file__).parents[2] / "deploy" / "systemd"
+from tests.e2e.programs import GATEWAY
+
+REPOSITORY = Path(__file__).parents[2]
+FOLDER, CONFIGS = REPOSITORY / "deploy" / "systemd", REPOSITORY / "config"
 UNIT = FOLDER / "prostar-gateway.service"
 PROGRAM = "/opt/prostar-gateway/current/bin/prostar-gateway"
 DROP_INS = [(), ("low-ports.conf",), ("credentials.conf",), ("low-ports.conf", "credentials.conf")]
@@ -82,6 +85,21 @@ def test_a_bad_configuration_is_not_tried_again() -> None:
 
     assert settings(UNIT.name)["RestartPreventExitStatus"] == [str(EX_CONFIG)]
     assert settings(UNIT.name)["Restart"] == ["always"]
+
+
+def test_a_reload_that_is_refused_fails(tmp_path: Path) -> None:
+    """The signal goes out first, so that the gateway counts and logs it; systemd goes by the last exit status."""
+    signal, check = settings(UNIT.name)["ExecReload"]
+    assert signal == "/bin/kill -HUP $MAINPID"
+    program, _, arguments = check.partition(" ")
+    assert program == PROGRAM
+    (started,) = settings(UNIT.name)["ExecStart"]
+    assert arguments.split()[-2:] == started.split()[-2:]  # the same file
+    for text, status in (((CONFIGS / "minimal.toml").read_text(), 0), ("site = 1\n", 78)):
+        (tmp_path / "site.toml").write_text(text)
+        asked = [*GATEWAY, *arguments.split()[:-1], str(tmp_path / "site.toml")]
+        done = subprocess.run(asked, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stdout, bool(done.stderr)) == (status, "", status != 0)
 
 
 def test_it_opens_serial_ports_and_no_other_devices() -> None:

@@ -112,7 +112,10 @@ def judge(report: str) -> tuple[int, str]:
     try:
         entries = json.loads(report)["dependencies"]
     except (ValueError, KeyError, TypeError):
-        return 3, "the advisory service could not be asked; nothing is known either way"
+        return (
+            3,
+            "the advisory service could not be asked; nothing is known either way. Try again where it can be reached",
+        )
     asked = [entry for entry in entries if "skip_reason" not in entry]
     holes = [
         f"  {entry['name']} {entry['version']}: {hole['id']}, mended in {', '.join(hole['fix_versions']) or 'none'}"
@@ -122,7 +125,8 @@ def judge(report: str) -> tuple[int, str]:
     if holes:
         return 1, "\n".join((f"{len(holes)} known holes:", *holes))
     if not entries or len(asked) < len(entries):
-        return 3, f"the advisory service could be asked about {len(asked)} of {len(entries)} libraries only"
+        few = f"the advisory service could be asked about {len(asked)} of {len(entries)} libraries only"
+        return 3, f"{few}; of the others nothing is known either way. Try again where it can be reached"
     return 0, f"no known hole in {len(asked)} libraries"
 
 
