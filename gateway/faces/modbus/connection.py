@@ -2,8 +2,9 @@
 
 Rule 1: replies leave in the order of their requests. A request that waits for the line holds back
         what came after it on this connection, and nothing on any other.
-Rule 2: nothing grows without bound. While `MAX_WAITING` replies are due, or `MAX_UNSENT` bytes
-        are not taken by the client, no further request is looked at and nothing is read.
+Rule 2: nothing grows without bound. While `MAX_WAITING` replies are due, or the client has not taken the last ones, no
+        further request is looked at and nothing is read. At most `MAX_UNSENT` bytes wait to be taken: one burst, or
+        the replies that were due; those that come to be known in the meantime are still due.
 Rule 3: every request is answered, or its connection ends, within `reply_timeout_s` of its arrival: framing lost or
         end of stream lets what came before be answered first; a client that is gone has its questions withdrawn
         and gets nothing; a server that stops answers 06 to what it has not begun.
@@ -36,7 +37,9 @@ logger = logging.getLogger(__name__)
 
 MAX_WAITING = 16
 MAX_UNSENT = 8192
-MAX_BURST = 64  # hot replies joined into one write
+LONGEST_REPLY = 260
+MAX_HELD_BACK = 2048  # what a transport may collect (tls_session.py) before it sends
+MAX_BURST = (MAX_UNSENT - MAX_HELD_BACK) // LONGEST_REPLY  # replies joined into one write
 READ_SIZE = 12  # a read request on the wire: MBAP 7, function, address, quantity
 PIECE = 2048  # how much of a long segment is cut into requests at a time
 TURN = 256  # requests looked at before other connections have their turn
@@ -112,7 +115,7 @@ class Connection(asyncio.Protocol):
             return
         self.client = client
         keep_alive(transport)
-        self._transport.set_write_buffer_limits(high=MAX_UNSENT)
+        self._transport.set_write_buffer_limits(high=0)  # whatever the kernel does not take pauses us (rule 2)
         self._write = self._transport.write
         self._direct = True
 
@@ -156,6 +159,7 @@ class Connection(asyncio.Protocol):
     def resume_writing(self) -> None:
         """The client took its replies."""
         self._unsent_since = None
+        self._guarded(self._send_due)
         self._guarded(self._work)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -302,7 +306,7 @@ class Connection(asyncio.Protocol):
                 pause_s, self.client.pause_s = self.client.pause_s, 0.0
                 self._resume = asyncio.get_running_loop().call_later(pause_s, self._work_on)
                 break
-            if len(out) >= MAX_BURST:
+            if len(out) >= 2 * MAX_BURST:  # a transaction id and the rest, each
                 self._write(b"".join(out))
                 out.clear()
         if out:
@@ -374,7 +378,9 @@ class Connection(asyncio.Protocol):
         self._work()
 
     def _send_due(self) -> None:
-        """Send the replies whose turn it is (rule 1)."""
+        """Send the replies whose turn it is (rule 1), if the client takes any (rule 2)."""
+        if self._unsent_since is not None:
+            return
         out: list[bytes] = []
         while self._due and (reply := self._due[0].reply) is not None:
             out.append(self._due.popleft().tid)

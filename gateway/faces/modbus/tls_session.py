@@ -6,7 +6,8 @@ Rule 2: a handshake ends within `handshake_timeout_s` of its first byte's chance
         its first byte. Nothing waits for a handshake but its own connection.
 Rule 3: a handshake that fails has one reason, out of `REASONS`; the client gets OpenSSL's alert and the connection
         ends (R-10, R-11).
-Rule 4: memory is bounded by one record and what the transport below holds back.
+Rule 4: memory is bounded by one record, what the transport below holds back, and `MAX_HELD_BACK` bytes of replies that
+        go out together.
 Rule 5: no exception leaves this file.
 """
 
@@ -22,7 +23,7 @@ from typing import Any, Protocol, cast
 
 from gateway.core.clients import Client
 from gateway.errors import CertificateRefused
-from gateway.faces.modbus.connection import Connection
+from gateway.faces.modbus.connection import MAX_HELD_BACK, Connection
 
 logger = logging.getLogger(__name__)
 
@@ -180,8 +181,8 @@ class TlsSession(asyncio.Transport, asyncio.Protocol):
         self._raw.set_write_buffer_limits(high, low)
 
     def get_write_buffer_size(self) -> int:
-        """Bytes that the kernel has not taken."""
-        return self._raw.get_write_buffer_size()
+        """Bytes that the kernel has not taken, or was not given yet."""
+        return self._raw.get_write_buffer_size() + self._to_send.pending
 
     def can_write_eof(self) -> bool:
         """It ends with `close` only."""
@@ -198,7 +199,7 @@ class TlsSession(asyncio.Transport, asyncio.Protocol):
         except ssl.SSLError:
             self.abort()
             return
-        if not self._busy:
+        if not self._busy or self._to_send.pending >= MAX_HELD_BACK:
             self._flush()
 
     def close(self) -> None:

@@ -4,28 +4,56 @@ from __future__ import annotations
 
 import asyncio
 import socket
+from dataclasses import replace
 
-from gateway.faces.modbus.connection import MAX_BURST, MAX_UNSENT, MAX_WAITING
+import pytest
+
+from gateway.core.snapshot import Block
+from gateway.devices.model import Space
+from gateway.faces.modbus.connection import MAX_UNSENT, MAX_WAITING, Connection
 from gateway.modbus import mbap
-from tests.faces.modbus.conftest import Running, read, registers
+from tests.faces.modbus.conftest import Client, Running, World, read, registers
+
+LONGEST = bytes.fromhex("03 0000 007d")
+"""A read whose reply is as long as one can be: 125 registers."""
 
 
-async def test_it_is_paused_then_cut_off(running: Running) -> None:
-    world = running.world
+def remember_the_longest(world: World) -> None:
+    device, now = world.device(12), world.clock.now
     world.poll(12)
-    client = await running.connect()
-    sock = client.writer.get_extra_info("socket")
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    client.reader._transport.pause_reading()  # type: ignore[attr-defined]
-    burst = mbap.encode(1, 12, bytes.fromhex("03 0000 0050")) * 1000
-    connection = next(iter(running.server._connections))
+    block = Block(Space.REGISTERS, 0, 125, registers(2, 0, 125), now)
+    device.snapshot = replace(device.snapshot, version=device.snapshot.version + 1, blocks=(block,))
+
+
+async def deaf(running: Running) -> tuple[Client, Connection]:
+    """A client that reads nothing, and its connection.
+
+    Over a pair of sockets: how much TCP holds, up to tens of megabytes, and when it sends again is the kernel's affair.
+    """
+    near, far = socket.socketpair()
+    near.settimeout(0.0)
+    near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 32768)
+    client = Client(*await asyncio.open_unix_connection(sock=far))
+    running.clients.append(client)
+    client.writer.transport.pause_reading()  # type: ignore[attr-defined]  # streams say WriteTransport
+    running.server.listeners[0]._accepted(near, ("127.0.0.1", 1))
+    (connection,) = running.server._connections
+    return client, connection
+
+
+@pytest.mark.parametrize("at_once", [1, 7, 16, 1000])
+async def test_it_is_paused_then_cut_off(running: Running, at_once: int) -> None:
+    world = running.world
+    remember_the_longest(world)
+    client, connection = await deaf(running)
+    burst = mbap.encode(1, 12, LONGEST) * at_once
     async with asyncio.timeout(30):
         while connection._unsent_since is None:
             client.send(burst)
-            await asyncio.sleep(0.001)
+            await asyncio.sleep(0)
     asked = world.stats.requests
     assert connection._transport is not None
-    assert connection._transport.get_write_buffer_size() <= MAX_UNSENT + MAX_BURST * 260, "and one burst over it"
+    assert 0 < connection._transport.get_write_buffer_size() <= MAX_UNSENT
     client.send(burst)
     await asyncio.sleep(0.01)
     assert world.stats.requests == asked, "nothing more is looked at"
@@ -37,20 +65,51 @@ async def test_it_is_paused_then_cut_off(running: Running) -> None:
 
 async def test_who_takes_its_replies_late_gets_them_all(running: Running) -> None:
     running.world.poll(12)
-    client = await running.connect()
-    client.reader._transport.pause_reading()  # type: ignore[attr-defined]
-    connection = next(iter(running.server._connections))
+    client, connection = await deaf(running)
     count = 0
     async with asyncio.timeout(30):
         while connection._unsent_since is None:
             client.send(mbap.encode(1, 12, bytes.fromhex("03 0000 0050")) * 1000)
             count += 1000
             await asyncio.sleep(0.001)
-    client.reader._transport.resume_reading()  # type: ignore[attr-defined]
+    client.writer.transport.resume_reading()  # type: ignore[attr-defined]
     reply = mbap.encode(1, 12, b"\x03\xa0" + registers(2, 0, 80))
     async with asyncio.timeout(30):
         assert await client.reader.readexactly(count * len(reply)) == reply * count
     assert running.world.stats.cache_hits == count
+
+
+async def test_replies_that_come_to_be_known_meanwhile_wait_in_their_places(running: Running) -> None:
+    world = running.world
+    remember_the_longest(world)
+    line = world.line(11)
+    line.held = True
+    client, connection = await deaf(running)
+    asked: list[tuple[int, bytes]] = []
+
+    def ask(unit: int, pdu: bytes, reply: bytes) -> None:
+        client.ask(len(asked), unit, pdu)
+        asked.append((unit, reply))
+
+    longest = b"\x03\xfa" + registers(2, 0, 125)
+    async with asyncio.timeout(30):
+        while connection._unsent_since is None:
+            for _ in range(20):
+                ask(12, LONGEST, longest)
+            for at in range(MAX_WAITING):
+                ask(11, *read(11, at, 80 - at))
+            await running.until(lambda: bool(line.waiting) or connection._unsent_since is not None)
+            for _ in range(MAX_WAITING):  # one by one, so that one of them finds the kernel full
+                if line.waiting:
+                    line.release(1)
+            assert connection._transport is not None
+            assert connection._transport.get_write_buffer_size() <= MAX_UNSENT
+    line.held = False
+    line.release()
+    client.writer.transport.resume_reading()  # type: ignore[attr-defined]
+    async with asyncio.timeout(30):
+        replies = await client.adus(len(asked))
+    assert replies == [mbap.Adu(tid & 0xFFFF, unit, reply) for tid, (unit, reply) in enumerate(asked)]
 
 
 async def test_no_more_than_the_bound_waits_on_the_line(running: Running) -> None:

@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gateway.core.ratelimit import ClientRate
+from gateway.faces.modbus.connection import MAX_UNSENT
 from gateway.faces.modbus.settings import RateSettings
 from gateway.faces.modbus.tls_session import _Records
 from gateway.modbus import mbap
@@ -207,21 +208,21 @@ async def test_the_end_of_the_gateway_is_said_in_tls(serve_tls: ServeTls) -> Non
     await stopping
 
 
-async def test_f31_a_client_that_takes_no_replies_is_paused(serve_tls: ServeTls) -> None:
+@pytest.mark.parametrize("in_a_record", [1, 64, 1365])
+async def test_f31_a_client_that_takes_no_replies_is_paused(serve_tls: ServeTls, in_a_record: int) -> None:
     site = await serve_tls()
     site.world.poll(12)
     hand, other = await Hand.of(site), await site.connect("reader")
     await hand.shake()
     hand.client.writer.transport.pause_reading()  # type: ignore[attr-defined]  # streams say WriteTransport
-    request = mbap.encode(1, 12, read(12, 0, 80)[0]) * 64
-    asked = 0
-    while all(session.is_reading() for session in site.door._sessions):
-        hand.client.send(hand.sealed(request))
-        asked += 64
+    request = mbap.encode(1, 12, read(12, 0, 80)[0]) * in_a_record
+    while all(session.connection._unsent_since is None for session in site.door._sessions):
+        hand.client.send(b"".join(hand.sealed(request) for _ in range(1365 // in_a_record)))
         await asyncio.sleep(0)
-        assert asked < 1 << 17
-    (session,) = [session for session in site.door._sessions if not session.is_reading()]
-    assert session.get_write_buffer_size() < 65536
+        assert site.world.stats.requests < 1 << 18
+    (session,) = [session for session in site.door._sessions if session.connection._unsent_since is not None]
+    assert not session.is_reading()
+    assert 0 < session.get_write_buffer_size() <= MAX_UNSENT
     assert await other.query(11, PDU) == REPLY
     hand.client.reset()
 
