@@ -101,11 +101,11 @@ install_release() {
   new=$home/releases/$version-$(date -u +%Y%m%dT%H%M%S)
   [[ ! -e $new ]] || fail "$new is there already; wait a second"
   # shellcheck disable=SC2064 # the folder of now
-  trap "rm -rf '$new'" EXIT
+  trap "rm -rf '$new'; echo 'install.sh: no release was made; nothing was changed' >&2" EXIT
   make_release "$new" "$wheels"
   if [[ -n $before && -e $config ]]; then
     "$new/bin/prostar-gateway" check-config -c "$config" >/dev/null ||
-      fail "release $version refuses $config; nothing was changed"
+      fail "release $version refuses $config"
   fi
   trap - EXIT
   [[ -z $before ]] || point previous "$before"

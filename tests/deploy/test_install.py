@@ -26,8 +26,21 @@ PLACED = (
     "etc/udev/rules.d/99-prostar-gateway.rules",
     "usr/local/bin/prostar-gateway",
 )
-STORY = ("install", "first-start", "look", "backup", "restore", "upgrade", "rollback", "remove")
-"""The blocks of docs/install.md whose commands this file runs, in order, but for those of systemd and the editor."""
+STORY = (
+    "install",
+    "first-start",
+    "look",
+    "rehearsal",
+    "",
+    "rehearsal-look",
+    "backup",
+    "restore",
+    "upgrade",
+    "rollback",
+    "remove",
+)
+"""The blocks of docs/install.md whose commands this file runs, in order, but for those of systemd and the editor, and
+for what looks at the rehearsal, which tests/docs/test_blocks.py runs."""
 
 
 def install(clone: Path, destination: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -76,6 +89,7 @@ def test_a_release_that_cannot_be_made_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "wheels").mkdir()
     done = install(ROOT, tmp_path / "machine", "--wheels", str(tmp_path / "wheels"))
     assert done.returncode != 0
+    assert done.stderr.endswith("install.sh: no release was made; nothing was changed\n")
     assert [path for path in (tmp_path / "machine").rglob("*") if path.is_file()] == []
 
 

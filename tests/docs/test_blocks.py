@@ -37,6 +37,7 @@ ELSEWHERE = {
     r"(apt-get install|systemctl|journalctl|editor|ls -l /dev/serial)": "tests/deploy/test_install.py",
     r"python (-m tests.fuzz.corpus|tests/fuzz/fuzz_)": "tests/fuzz/test_fuzz.py",
     r"prostar-gateway scan ": "tests/cli/test_scan.py",
+    r"prostar-gateway simulate --tcp": "tests/simulator/test_simulate.py",
 }
 """Commands that change the machine they run on or take one with more on it, and where they are run instead."""
 
@@ -187,7 +188,7 @@ def test_commands_work_as_printed(
             assert (ROOT / (program[1].removesuffix(".py").replace(".", "/") + ".py")).is_file()
             run(tmp_path, f"{command} --help")
         else:
-            for foreign in ("curl", "snmpwalk", "promtool"):
+            for foreign in ("curl", "snmpwalk", "promtool", "mbpoll"):
                 if foreign in command:
                     peer(foreign)
             shown = run(tmp_path, on_the(request.getfixturevalue("site"), command, tmp_path))
@@ -199,7 +200,7 @@ def on_the(site: Running, command: str, folder: Path) -> str:
     config = str(site.folder / "site.toml")
     command = re.sub(r"-c (/etc/prostar-gateway/site\.toml|site\.toml|FILE)", f"-c {config}", command)
     for printed, port in ((1502, site.modbus), (1161, site.snmp), (9850, site.http)):
-        command = command.replace(f"127.0.0.1:{printed}", f"127.0.0.1:{port}")
+        command = command.replace(f"127.0.0.1:{printed}", f"127.0.0.1:{port}").replace(f"-p {printed} ", f"-p {port} ")
     if "prostar-gateway restore" in command:  # nothing is restored below a gateway that runs
         (folder / "other.toml").write_text(Path(config).read_text().replace("/state", "/other-state"))
         command = command.replace(config, str(folder / "other.toml"))
