@@ -12,7 +12,6 @@ Rule 4: each waiter gets its own part, with its own function code. An exception 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 
 from gateway.core.requests import ClientRead, Span
 from gateway.devices.model import Space
@@ -69,5 +68,5 @@ def _nearest(
         if saved_s <= 0 or count > most(span.space) or not mapped(span.space, first, end):
             continue
         if best is None or saved_s > best[0]:
-            best = (saved_s, replace(span, first=first, count=count), read)
+            best = (saved_s, span._replace(first=first, count=count), read)
     return None if best is None else (best[1], best[2])

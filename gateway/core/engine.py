@@ -63,7 +63,7 @@ from gateway.errors import (
     ShuttingDown,
 )
 from gateway.modbus.collector import Echo
-from gateway.modbus.pdu import Function, is_exception
+from gateway.modbus.pdu import EXCEPTION_BIT, Function, is_exception
 from gateway.modbus.rtu_wire import RtuWire
 from gateway.modbus.transactions import Ended, Failed, Replied, Wire
 
@@ -120,6 +120,7 @@ class LineEngine:
         self._state_since = now
         self._error = "not opened yet"
         self._finishing = False
+        self._rewriting: list[DeviceRecord] = []  # those with something that must be written again and again
 
     @property
     def echo(self) -> Echo:
@@ -145,6 +146,7 @@ class LineEngine:
         for record in self._records.values():
             record.breaker.line_opened(now)
             self._polling.restart(record, now)
+        self._scheduler.polls_changed()
 
     def closed(self, error: str, now: float) -> None:
         """The port is closed: what waited ends with LineDown, or by rule 9; online devices become stale."""
@@ -158,6 +160,7 @@ class LineEngine:
         for turn in self._aside.clear():
             self._finish(waiters_of(turn), reason)
         self._finish(self._scheduler.drain(), reason)
+        self._scheduler.polls_changed()
         for record in self._records.values():
             if record.state is DeviceState.ONLINE:
                 self._change(record, DeviceState.STALE, now, reason="line down")
@@ -203,6 +206,7 @@ class LineEngine:
         """Go on by other settings of the same wire (`LineSettings.same_wire`)."""
         self.settings = settings
         self._polling.adjust(settings, self._records.values(), now)
+        self._scheduler.polls_changed()
         self._scheduler.adjust(limit=settings.queue_limit, limit_s=settings.queue_limit_s)
 
     def finish(self) -> None:
@@ -218,10 +222,11 @@ class LineEngine:
     def on_timer(self, now: float) -> None:
         """A deadline may have passed."""
         self._ended(self._wire.on_timer(now), now)
-        self._finish(self._scheduler.expired(now), QueueTimeout(f"waited {self.settings.queue_limit_s:g} s"))
-        for record in self._records.values():
-            if record.rewrites:
-                self._polling.watch_rewrites(record, now)
+        expired = self._scheduler.expired(now)
+        if expired:
+            self._finish(expired, QueueTimeout(f"waited {self.settings.queue_limit_s:g} s"))
+        for record in self._rewriting:
+            self._polling.watch_rewrites(record, now)
 
     def step(self, now: float) -> bytes | None:
         """Hand out outcomes, then give the frame to write now, or None."""
@@ -269,12 +274,12 @@ class LineEngine:
         if self._finishing:  # polls are due, and nobody will make them
             return wire_at
         moments = [wire_at, self._scheduler.next_expiry()]
-        moments += [self._polling.next_warning(record) for record in self._records.values() if record.rewrites]
+        moments += [self._polling.next_warning(record) for record in self._rewriting]
         ready_at = self._wire.ready_at(now)
         if ready_at not in {math.inf, wire_at} and not self._aside.blocks():  # else the wire comes first
             due = now if self._aside.due() else self._scheduler.next_due(now)
             moments.append(None if due is None else max(due, ready_at))
-        return min((moment for moment in moments if moment is not None), default=None)
+        return min([moment for moment in moments if moment is not None], default=None)
 
     def _check(self, device: Device) -> None:
         """Raise why nothing can be asked of this device now."""
@@ -317,14 +322,16 @@ class LineEngine:
             record = self._records[turn.device.unit_id]
             record.asked_at = sent_at
             error = event.error if isinstance(event, Failed) else self._relayed(event.pdu)
-            exception = isinstance(event, Replied) and is_exception(event.pdu)
-            turn.device.stats.exceptions += exception
-            failed = "exception" if exception else None if error is None else error.label
+            failed = None if error is None else error.label
+            if isinstance(event, Replied) and event.pdu[0] >= EXCEPTION_BIT:
+                turn.device.stats.exceptions += 1
+                failed = "exception"
             seconds = self._accounting.ended(turn, sent_at, now, failed)
             if error is not None:
                 record.doubt.missed(turn.pdu[0])
                 blameless = isinstance(event, Failed) and event.blameless and not record.breaker.is_open
                 if blameless and self._aside.again(turn):
+                    self._scheduler.polls_changed()
                     continue
                 self._on_no_reply(turn, record, error, now)
             else:
@@ -333,8 +340,10 @@ class LineEngine:
             self._aside.forget(turn)
             if isinstance(turn, ReadTurn):
                 self._scheduler.charge(turn, seconds)
-            if error is not None or isinstance(turn, PollItem) or record.state is not DeviceState.ONLINE:
-                self._judge(record, now)  # a good answer to anybody else changes nothing
+            if error is None and type(turn) is ReadTurn and record.state is DeviceState.ONLINE:
+                continue  # a good answer to a client changes nothing else
+            self._judge(record, now)
+            self._scheduler.polls_changed()
         self._watch_window(now)
 
     def _relayed(self, pdu: bytes) -> RequestError | None:
@@ -460,7 +469,11 @@ class LineEngine:
             record.rewrites[point.name] = now
         else:
             record.rewrites.pop(point.name, None)
+        if record not in self._rewriting:
+            self._rewriting.append(record)
         self._polling.watch_rewrites(record, now)
+        if not record.rewrites:
+            self._rewriting.remove(record)
 
     def _heard(self, record: DeviceRecord, now: float) -> None:
         """The device is there; after a quarantine everything is read anew."""

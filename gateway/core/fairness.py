@@ -22,6 +22,7 @@ from gateway.core.site import Device
 from gateway.errors import QueueFull
 
 MAX_CLIENTS = 256
+_NONE: dict[bytes, ClientRead] = {}
 
 
 @dataclass(slots=True, eq=False)
@@ -41,6 +42,7 @@ class FairQueue:
         self._limit_s = limit_s
         self._shares: dict[str, _Share] = {}
         self._waiting: dict[tuple[int, bytes], ClientRead] = {}
+        self._of_unit: dict[int, dict[bytes, ClientRead]] = {}  # the same by device; none that is empty
         self._arrivals: deque[tuple[float, Waiter, ClientRead]] = deque()
         self._level_s = 0.0  # used time of the client that went last
 
@@ -66,7 +68,7 @@ class FairQueue:
             if len(self._waiting) >= self._limit:
                 loser = self._give_way(waiter.client)
             read = ClientRead(device, pdu, self._lane, span, waiter.asked_at)
-            self._waiting[key] = read
+            self._keep(key, read)
         read.waiters.append(waiter)
         self._arrivals.append((waiter.asked_at + self._limit_s, waiter, read))
         self._enqueue(waiter.client, read)
@@ -81,7 +83,7 @@ class FairQueue:
             read.waiters += newer.waiters
             newer.waiters = []
             newer.started = True
-        self._waiting[key] = read
+        self._keep(key, read)
         for client in read.clients():
             self._enqueue(client, read, first=True)
 
@@ -113,7 +115,7 @@ class FairQueue:
 
     def of_device(self, device: Device) -> list[ClientRead]:
         """All wanted reads that wait for one device, oldest first."""
-        return [read for read in self._waiting.values() if read.device is device and read.wanted]
+        return [read for read in self._of_unit.get(device.unit_id, _NONE).values() if read.wanted]
 
     def take(self, read: ClientRead) -> None:
         """The read is being made; it takes no new waiters."""
@@ -121,6 +123,10 @@ class FairQueue:
         key = (read.device.unit_id, read.pdu)
         if self._waiting.get(key) is read:
             del self._waiting[key]
+            reads = self._of_unit[key[0]]
+            del reads[key[1]]
+            if not reads:
+                del self._of_unit[key[0]]
 
     def charge(self, clients: list[str], seconds: float) -> None:
         """Book line time on those who waited for it (rule 1)."""
@@ -152,6 +158,10 @@ class FairQueue:
         for read in out:
             self.take(read)
         return out
+
+    def _keep(self, key: tuple[int, bytes], read: ClientRead) -> None:
+        self._waiting[key] = read
+        self._of_unit.setdefault(key[0], {})[key[1]] = read
 
     def _enqueue(self, client: str, read: ClientRead, *, first: bool = False) -> None:
         share = self._shares.get(client)

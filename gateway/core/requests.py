@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
+from typing import NamedTuple
 
 from gateway.core.site import Device, Outcome
 from gateway.devices.model import Space
@@ -99,14 +100,13 @@ class ClientRead:
         return list(dict.fromkeys(waiter.client for waiter in self.waiters if not waiter.left))
 
 
-@dataclass(frozen=True, slots=True)
-class Span:
+class Span(NamedTuple):
     """Addresses `first` to `first + count - 1` of one space, and the function that asked for them."""
 
     space: Space
     function: int
     first: int
-    count: int
+    count: int  # type: ignore[assignment]  # it hides tuple.count, which nobody calls
 
     @classmethod
     def of(cls, device: Device, request: ReadRequest) -> Span:

@@ -14,10 +14,13 @@ Rule 5: background reads go only when nothing else is to be done and they are ov
 Rule 6: client reads share the line fairly (fairness.py) and are joined where that saves line time (coalescing.py).
 Rule 7: where a line carries several transactions at once, nothing is begun that must wait for one under way
         (under_way.py). A write that waits for its device lets no further read of that device begin.
+Rule 8: when the next poll is due is looked up once and holds until then, or until who owns the polls says that they
+        changed: a line that serves clients from memory and from far away asks it thousands of times a second.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -97,6 +100,7 @@ class Scheduler:
         self._writes: dict[Lane, deque[WriteTurn]] = {Lane.SLAVE_CONTROL: deque(), Lane.WRITE: deque()}
         self._served_at = dict.fromkeys(Lane, now)
         self._passed = dict.fromkeys(Lane, 0)
+        self._no_poll_before = -math.inf  # as far as is known
 
     def __len__(self) -> int:
         return len(self._clients) + len(self._background) + sum(map(len, self._writes.values()))
@@ -117,6 +121,10 @@ class Scheduler:
         if len(queue) >= self._limit:
             raise QueueFull
         queue.append(write)
+
+    def polls_changed(self) -> None:
+        """A poll may be due sooner than it was (rule 8)."""
+        self._no_poll_before = -math.inf
 
     def retry(self, read: ClientRead) -> None:
         """Put a read that failed back at the head of its queue."""
@@ -148,7 +156,7 @@ class Scheduler:
         """When there is something to do; `now` or earlier: at once. None: never."""
         if any(self._write_head(lane) for lane in self._writes) or self._clients.head(self._ready) is not None:
             return now
-        due = self._next_poll_due()
+        due = self._next_poll_due(now)
         background = self._background.head(self._ready)
         if background is None or (due is not None and due <= now):
             return due
@@ -160,8 +168,8 @@ class Scheduler:
     def next(self, now: float) -> Turn | None:
         """Take the turn whose time it is at `now`, or None."""
         ready: dict[Lane, float] = {}  # lane → when its head will have waited too long
-        for lane in self._writes:
-            write = self._write_head(lane)
+        for lane, queue in self._writes.items():
+            write = self._write_head(lane) if queue else None
             if write is not None:
                 ready[lane] = write.queued_at + PATIENCE_S[lane]
         client = self._clients.head(self._ready)
@@ -200,6 +208,10 @@ class Scheduler:
 
     def _choose(self, ready: dict[Lane, float], now: float, *, poll_grace_s: float) -> Lane:
         """Rules 1 and 2."""
+        if len(ready) == 1:
+            (first,) = ready
+            self._passed[first] = 0
+            return first
         first = min(ready)
         aged = [lane for lane, at in ready.items() if at <= now and self._passed[lane] > 0]
         chosen = max(aged, key=lambda lane: (self._passed[lane], -lane)) if aged else first
@@ -247,7 +259,7 @@ class Scheduler:
         return self._cost(Space.REGISTERS, 3) if read.span is None else self._cost(read.span.space, read.span.count)
 
     def _fits(self, background: ClientRead, now: float) -> bool:
-        due = self._next_poll_due()
+        due = self._next_poll_due(now)
         return due is None or now + self._read_s(background) <= due
 
     def _gather_at(self, background: ClientRead) -> float:
@@ -268,11 +280,23 @@ class Scheduler:
         ]
         return min(in_the_way, key=itemgetter(0))[1] if in_the_way else None
 
-    def _next_poll_due(self) -> float | None:
+    def _soonest_poll(self) -> float:
+        """When the next poll of any device is due, whether or not it could begin then (rule 8)."""
+        if self._no_poll_before == -math.inf:
+            found = (polls.first() for polls in self._polls.values())
+            self._no_poll_before = min((first[0] for first in found if first is not None), default=math.inf)
+        return self._no_poll_before
+
+    def _next_poll_due(self, now: float) -> float | None:
+        soonest = self._soonest_poll()
+        if now < soonest:
+            return None if soonest == math.inf else soonest
         firsts = (polls.first() for polls in self._polls.values() if self._ready(polls.device))
         return min((first[0] for first in firsts if first is not None), default=None)
 
     def _due_poll(self, now: float) -> tuple[float, PollItem] | None:
+        if now < self._soonest_poll():
+            return None
         best: tuple[float, PollItem] | None = None
         for polls in self._polls.values():
             first = polls.first() if self._ready(polls.device) else None

@@ -25,6 +25,7 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from gateway.core.identification import identify
 from gateway.core.policy import READ_DEVICE_IDENTIFICATION
@@ -48,8 +49,7 @@ class FromMemory:
     valid_until: float
 
 
-@dataclass(frozen=True, slots=True)
-class Ask:
+class Ask(NamedTuple):
     """Ask the line; give this back to `Serving.learn` with what came."""
 
     pdu: bytes

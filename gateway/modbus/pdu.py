@@ -29,7 +29,7 @@ MAX_PDU = 253
 MAX_BITS = 2000
 MAX_REGISTERS = 125
 
-_EXCEPTION_BIT = 0x80
+EXCEPTION_BIT = 0x80
 _MEI_IDENTIFICATION = 0x0E
 _IDENTIFICATION_HEADER = 7
 _COIL_VALUES = (0x0000, 0xFF00)
@@ -90,6 +90,7 @@ class ReadRequest:
         return 2 + ((self.count + 7) // 8 if self.function in _BIT_READS else 2 * self.count)
 
 
+@lru_cache(maxsize=1024)  # a face, the line and the check of the reply look at the same request
 def parse_read(pdu: bytes) -> ReadRequest:
     """Read a request PDU of functions 1 to 4.
 
@@ -106,12 +107,12 @@ def parse_read(pdu: bytes) -> ReadRequest:
 
 def exception_reply(function: int, code: int) -> bytes:
     """The two bytes that refuse a request of `function` (§7)."""
-    return bytes((function | _EXCEPTION_BIT, code))
+    return bytes((function | EXCEPTION_BIT, code))
 
 
 def is_exception(pdu: bytes) -> bool:
     """Whether a reply PDU is an exception (bit 7 of the function code)."""
-    return bool(pdu) and pdu[0] >= _EXCEPTION_BIT
+    return bool(pdu) and pdu[0] >= EXCEPTION_BIT
 
 
 @lru_cache(maxsize=256)  # a request is looked at when it goes out, and when its reply comes
@@ -140,7 +141,7 @@ def reply_fits(request: bytes, reply: bytes) -> bool:
     Raises as `expected_reply_size` when the request itself is not one of ours.
     """
     size = expected_reply_size(request)
-    if len(reply) == 2 and reply[0] == request[0] | _EXCEPTION_BIT:
+    if len(reply) == 2 and reply[0] == request[0] | EXCEPTION_BIT:
         return reply[1] != 0
     if not reply or reply[0] != request[0]:
         return False

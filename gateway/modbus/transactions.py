@@ -14,8 +14,7 @@ from gateway.errors import RequestError
 from gateway.modbus.collector import Echo
 
 
-@dataclass(frozen=True, slots=True)
-class Replied:
+class Replied(NamedTuple):
     """The request was answered; `pdu` may be the device's exception."""
 
     pdu: bytes

@@ -22,6 +22,7 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import cast
 
 from gateway.core.clients import Client
@@ -41,6 +42,7 @@ LONGEST_REPLY = 260
 MAX_HELD_BACK = 2048  # what a transport may collect (tls_session.py) before it sends
 MAX_BURST = (MAX_UNSENT - MAX_HELD_BACK) // LONGEST_REPLY  # replies joined into one write
 READ_SIZE = 12  # a read request on the wire: MBAP 7, function, address, quantity
+READ_HEAD = b"\0\0\0\6"  # its protocol id and length
 PIECE = 2048  # how much of a long segment is cut into requests at a time
 TURN = 256  # requests looked at before other connections have their turn
 AT_ONCE_S = 0.1
@@ -136,6 +138,9 @@ class Connection(asyncio.Protocol):
                         return
                 elif len(data) > READ_SIZE:
                     data = self._answer_hot(data)
+                if len(data) == READ_SIZE and data[2:6] == READ_HEAD:
+                    self._take_one(Adu(int.from_bytes(data[:2]), data[6], data[7:]))
+                    return
             if data and not self._ending:
                 self._input += data
                 self._work()
@@ -288,6 +293,23 @@ class Connection(asyncio.Protocol):
             self._write(b"".join(out))  # may call pause_writing, which ends the loop
         return data[at:] if at else data
 
+    def _take_one(self, adu: Adu) -> None:
+        """Look at a request that is all that there is: nothing came before it that is not answered."""
+        self.seen = now = self._now()
+        out: list[bytes] = []
+        self._take(adu, now, out)
+        if out:
+            self._write(b"".join(out))  # may call pause_writing
+        if self.client.pause_s:
+            self._pause()
+        if self._due or self._resume is not None:
+            self._settle()
+
+    def _pause(self) -> None:
+        """Rule 4."""
+        pause_s, self.client.pause_s = self.client.pause_s, 0.0
+        self._resume = asyncio.get_running_loop().call_later(pause_s, self._work_on)
+
     def _work(self) -> None:
         """Look at what was received as far as rules 1 and 2 allow."""
         if self._over or self._resume is not None:
@@ -303,8 +325,7 @@ class Connection(asyncio.Protocol):
             self.seen = now
             self._take(self._adus.popleft(), now, out)
             if self.client.pause_s:
-                pause_s, self.client.pause_s = self.client.pause_s, 0.0
-                self._resume = asyncio.get_running_loop().call_later(pause_s, self._work_on)
+                self._pause()
                 break
             if len(out) >= 2 * MAX_BURST:  # a transaction id and the rest, each
                 self._write(b"".join(out))
@@ -358,13 +379,17 @@ class Connection(asyncio.Protocol):
             due.reply = answer
             return
         due.waiting = answer
-        due.ticket = answer.begin(self.peer, lambda outcome: self._done(due, outcome))
+        due.ticket = answer.begin(self.peer, partial(self._done, due))
 
     # The way out
 
     def _done(self, due: _Due, outcome: Outcome) -> None:
         """The line has answered a request of this connection."""
-        self._guarded(lambda: self._conclude(due, outcome))
+        try:
+            self._conclude(due, outcome)
+        except Exception:
+            logger.exception("event=connection_failed peer=%s", self.peer)
+            self._broken()
 
     def _conclude(self, due: _Due, outcome: Outcome) -> None:
         if self._over:
@@ -375,7 +400,10 @@ class Connection(asyncio.Protocol):
         if due is not self._due[0]:
             return
         self._send_due()
-        self._work()
+        if self._adus or self._input:
+            self._work()
+        else:
+            self._settle()
 
     def _send_due(self) -> None:
         """Send the replies whose turn it is (rule 1), if the client takes any (rule 2)."""

@@ -11,6 +11,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 from gateway.clock import Clock
 from gateway.core.clients import Client
@@ -40,8 +42,7 @@ RESERVED = range(248, 255)
 """Unit ids that no device may have (Modbus over serial line 2.2)."""
 
 
-@dataclass(frozen=True, slots=True)
-class Forward:
+class Forward(NamedTuple):
     """A read that the line has to answer."""
 
     unit: int
@@ -159,7 +160,7 @@ class Dispatcher:
             self.stats.cache_hits += 1
             return entry[3]
         try:
-            return self._look_at(request, pdu, client, Requester(client.name, role), now)
+            return self._look_at(request, pdu, client, _requester(client.name, role), now)
         except RequestError as error:
             return self.refuse(unit, pdu, client, error)
 
@@ -249,6 +250,9 @@ class Dispatcher:
         self.stats.exceptions[error.exception_code] += 1
         client.exceptions[error.exception_code] += 1
         return mbap.encode(0, unit, exception_reply(pdu[0], error.exception_code))[2:]
+
+
+_requester = lru_cache(maxsize=256)(Requester)
 
 
 def _usable(routes: Mapping[int, Serving]) -> Mapping[int, Serving]:
