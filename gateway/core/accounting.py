@@ -8,8 +8,9 @@ Rule 3: at most `MAX_CLIENTS` clients are named; the rest is booked under `OTHER
 
 from __future__ import annotations
 
-from gateway.core.requests import PollItem, ReadTurn, Turn, WriteTurn
+from gateway.core.requests import PollItem, ReadTurn, Turn
 from gateway.core.stats import LineStats
+from gateway.core.turns import clients_of
 from gateway.core.usage import UseMeter
 
 MAX_CLIENTS = 256
@@ -65,8 +66,9 @@ class Accounting:
         else:
             stats.failed[failed] += 1
             turn.device.stats.errors[failed] += 1
-        for client in _clients(turn):
-            self._book(client, seconds / max(1, len(_clients(turn))))
+        clients = clients_of(turn)
+        for client in clients:
+            self._book(client, seconds / len(clients))
         return seconds
 
     def _advance(self, now: float) -> None:
@@ -81,9 +83,3 @@ class Accounting:
         if client not in clients and len(clients) >= MAX_CLIENTS:
             client = OTHERS
         clients[client] = clients.get(client, 0.0) + seconds
-
-
-def _clients(turn: Turn) -> list[str]:
-    if isinstance(turn, ReadTurn):
-        return list(dict.fromkeys(waiter.client for read in turn.reads for waiter in read.waiters))
-    return [turn.waiter.client] if isinstance(turn, WriteTurn) else []

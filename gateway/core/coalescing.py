@@ -32,6 +32,8 @@ def join(
     span = head.span
     joined = [head]
     waiting = [read for read in others if read is not head and read.span is not None and not read.alone]
+    if not waiting:
+        return span, (head,)
     # Nearest first, and again after each success: the union grows and reaches further.
     while (near := _nearest(span, waiting, cost=cost, mapped=mapped, most=most)) is not None:
         span, read = near
@@ -56,6 +58,7 @@ def _nearest(
 ) -> tuple[Span, ClientRead] | None:
     best: tuple[float, Span, ClientRead] | None = None
     span_s = cost(span.space, span.count)
+    longest = most(span.space)
     for read in waiting:
         other = read.span
         if other is None or other.space is not span.space:
@@ -64,8 +67,10 @@ def _nearest(
         count = end - first
         if count == span.count:
             return span, read  # inside already: free, whatever the map says of it
+        if count > longest:
+            continue
         saved_s = span_s + cost(span.space, other.count) - cost(span.space, count)
-        if saved_s <= 0 or count > most(span.space) or not mapped(span.space, first, end):
+        if saved_s <= 0 or not mapped(span.space, first, end):
             continue
         if best is None or saved_s > best[0]:
             best = (saved_s, span._replace(first=first, count=count), read)

@@ -72,6 +72,7 @@ class DeviceRecord:
     def __init__(self, device: Device, polls: PollList, now: float) -> None:
         self.device = device
         self.polls = polls
+        self.breaker: Breaker = polls.breaker
         self.known = device.expected
         self.verified = False  # since the line was opened or the device came back
         self.restarting_until = 0.0  # a restart was commanded: its silence means nothing
@@ -84,11 +85,6 @@ class DeviceRecord:
         self._blocks: list[Block] = []  # no address is in two of them
         self._scaling: dict[str, Value] = {}  # what the device last told of it, since the line was opened
         device.snapshot = Snapshot(state_since=now)
-
-    @property
-    def breaker(self) -> Breaker:
-        """The device's breaker."""
-        return self.polls.breaker
 
     @property
     def state(self) -> DeviceState:

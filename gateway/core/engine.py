@@ -37,8 +37,10 @@ from gateway.core.accounting import Accounting
 from gateway.core.budget import read_cost
 from gateway.core.device_record import DeviceRecord
 from gateway.core.health import FIRST_PROBE_S, LAST_PROBE_S, Breaker
+from gateway.core.line_news import LineNews
 from gateway.core.polling import Polling
 from gateway.core.requests import Lane, PollItem, Purpose, ReadTurn, Turn, Waiter, WriteTurn
+from gateway.core.rewrites import Rewrites
 from gateway.core.scheduler import PollList, Scheduler
 from gateway.core.set_aside import SetAside
 from gateway.core.settings import LineSettings
@@ -114,13 +116,13 @@ class LineEngine:
         )
         self._accounting = Accounting(self.stats, now)
         self._aside = SetAside(self._under_way)
-        self._window_s = self._calm_window_s = self._wire.quarantine_s(now)
+        self._news = LineNews(settings.name, self._wire.quarantine_s(now))
         self._finished: deque[tuple[Waiter, Outcome]] = deque()
         self._state = LineState.DOWN
         self._state_since = now
         self._error = "not opened yet"
         self._finishing = False
-        self._rewriting: list[DeviceRecord] = []  # those with something that must be written again and again
+        self._rewrites = Rewrites(self._polling)
 
     @property
     def echo(self) -> Echo:
@@ -198,6 +200,20 @@ class LineEngine:
         return waiter
 
     @property
+    def is_open(self) -> bool:
+        """Whether the line is open."""
+        return self._state is LineState.OPEN
+
+    def due(self, now: float) -> bool:
+        """Whether something could begin now, if the wire let it."""
+        if self._finishing or self._state is LineState.DOWN or self._aside.blocks():
+            return False
+        if self._aside.due():
+            return True
+        due = self._scheduler.next_due(now)
+        return due is not None and due <= now
+
+    @property
     def busy(self) -> bool:
         """Whether a transaction is under way."""
         return bool(self._under_way)
@@ -225,8 +241,7 @@ class LineEngine:
         expired = self._scheduler.expired(now)
         if expired:
             self._finish(expired, QueueTimeout(f"waited {self.settings.queue_limit_s:g} s"))
-        for record in self._rewriting:
-            self._polling.watch_rewrites(record, now)
+        self._rewrites.watch(now)
 
     def step(self, now: float) -> bytes | None:
         """Hand out outcomes, then give the frame to write now, or None."""
@@ -273,8 +288,7 @@ class LineEngine:
         wire_at = self._wire.next_deadline()
         if self._finishing:  # polls are due, and nobody will make them
             return wire_at
-        moments = [wire_at, self._scheduler.next_expiry()]
-        moments += [self._polling.next_warning(record) for record in self._rewriting]
+        moments = [wire_at, self._scheduler.next_expiry(), *self._rewrites.moments()]
         ready_at = self._wire.ready_at(now)
         if ready_at not in {math.inf, wire_at} and not self._aside.blocks():  # else the wire comes first
             due = now if self._aside.due() else self._scheduler.next_due(now)
@@ -344,11 +358,11 @@ class LineEngine:
                 continue  # a good answer to a client changes nothing else
             self._judge(record, now)
             self._scheduler.polls_changed()
-        self._watch_window(now)
+        self._news.quarantine(self._wire.quarantine_s(now))
 
     def _relayed(self, pdu: bytes) -> RequestError | None:
         """What rule 11 makes of a reply."""
-        if not self._wire.relays or not is_exception(pdu) or pdu[1] not in _RELAYED:
+        if pdu[0] < EXCEPTION_BIT or not self._wire.relays or pdu[1] not in _RELAYED:
             return None
         return _RELAYED[pdu[1]]("an upstream gateway says so")
 
@@ -361,11 +375,11 @@ class LineEngine:
     def _on_reply(self, turn: Turn, record: DeviceRecord, event: Replied, now: float) -> None:
         record.doubt.answered(turn.pdu[0])
         self._heard(record, now)
-        if turn.purpose is Purpose.SETTLE:
-            record.heard(now)
-            self._aside.settled(turn)
-            return
         if isinstance(turn, PollItem):
+            if turn.purpose is Purpose.SETTLE:
+                record.heard(now)
+                self._aside.settled(turn)
+                return
             if is_exception(event.pdu):
                 self._polling.refused(turn, record, event.pdu[1], now)
             else:
@@ -380,7 +394,10 @@ class LineEngine:
             self._on_read(turn, record, event)
 
     def _on_read(self, turn: ReadTurn, record: DeviceRecord, event: Replied) -> None:
-        if is_exception(event.pdu) and len(turn.reads) > 1:
+        if not is_exception(event.pdu):
+            for read in turn.reads:
+                self._finish(read.waiters, part_of(turn, read, event.pdu))
+        elif len(turn.reads) > 1:
             if turn.span is not None and event.pdu[1] in _REFUSALS:
                 record.polls.refused(turn.span.space, turn.span.count)
             for read in reversed(turn.reads):
@@ -390,8 +407,7 @@ class LineEngine:
             turn.reads[0].put_off = True
             self._scheduler.retry(turn.reads[0])
         else:
-            for read in turn.reads:
-                self._finish(read.waiters, part_of(turn, read, event.pdu))
+            self._finish(turn.reads[0].waiters, event.pdu)
 
     def _on_failure(self, turn: Turn, record: DeviceRecord, error: RequestError, now: float) -> None:
         silent = isinstance(error, ReplyTimeout) and not isinstance(error, RelayedNoPath)
@@ -445,16 +461,7 @@ class LineEngine:
             record.breaker.missed(now, FIRST_PROBE_S if no_path else LAST_PROBE_S)
 
     def _puts_off(self, turn: ReadTurn, pdu: bytes) -> bool:
-        return is_exception(pdu) and pdu[1] == _BUSY and self.settings.retries > 0 and not turn.reads[0].put_off
-
-    def _watch_window(self, now: float) -> None:
-        """Say when late replies made the quarantine longer, and when it is as configured again."""
-        window_s = self._wire.quarantine_s(now)
-        if window_s > self._window_s:
-            log.warning("event=late_replies line=%s quarantine_s=%g", self.settings.name, window_s)
-        elif window_s < self._window_s and window_s <= self._calm_window_s:
-            log.info("event=late_replies_over line=%s quarantine_s=%g", self.settings.name, window_s)
-        self._window_s = window_s
+        return pdu[1] == _BUSY and self.settings.retries > 0 and not turn.reads[0].put_off
 
     def _written(self, turn: WriteTurn, record: DeviceRecord, now: float) -> None:
         """A write was, or may have been, taken: forget the old value and watch what must be rewritten."""
@@ -464,16 +471,7 @@ class LineEngine:
         point = written_point(turn.device, turn.pdu)
         if point is None or point.rewrite_s is None:
             return
-        held = point.released.held_by(int.from_bytes(turn.pdu[3:5], "big"), held=point.name in record.rewrites)
-        if held:
-            record.rewrites[point.name] = now
-        else:
-            record.rewrites.pop(point.name, None)
-        if record not in self._rewriting:
-            self._rewriting.append(record)
-        self._polling.watch_rewrites(record, now)
-        if not record.rewrites:
-            self._rewriting.remove(record)
+        self._rewrites.written(record, point, int.from_bytes(turn.pdu[3:5], "big"), now)
 
     def _heard(self, record: DeviceRecord, now: float) -> None:
         """The device is there; after a quarantine everything is read anew."""
@@ -493,21 +491,11 @@ class LineEngine:
 
     def _change(self, record: DeviceRecord, state: DeviceState, now: float, reason: str) -> None:
         before = record.state
-        lasted_s = record.become(state, now)
-        log.log(
-            logging.INFO if state is DeviceState.ONLINE else logging.WARNING,
-            "event=device_%s line=%s device=%s address=%d before=%s lasted_s=%.1f%s",
-            state,
-            self.settings.name,
-            record.device.name,
-            record.device.address,
-            before,
-            lasted_s,
-            f' reason="{reason}"' if reason else "",
-        )
+        self._news.device(record.device, before, record.become(state, now), reason)
 
     def _finish(self, waiters: Iterable[Waiter], outcome: Outcome) -> None:
-        self._finished.extend((waiter, outcome) for waiter in waiters)
+        for waiter in waiters:
+            self._finished.append((waiter, outcome))
 
     def _set_state(self, state: LineState, error: str, now: float) -> None:
         if state is not self._state:

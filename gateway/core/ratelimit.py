@@ -92,11 +92,13 @@ class LineLimiter:
     def take(self, client: Bucket, device: Device, now: float) -> str | None:
         """Take a token of the client, the device and the line, or none; returns whose limit is in the way."""
         own, line = self._buckets[device.unit_id]
-        taken: list[Bucket] = []
-        for bucket, name in ((client, CLIENT_LINE), (own, "device"), (line, "line")):
-            if not bucket.take(now):
-                for other in taken:
-                    other.give_back(1)
-                return name
-            taken.append(bucket)
+        if not client.take(now):
+            return CLIENT_LINE
+        if not own.take(now):
+            client.give_back(1)
+            return "device"
+        if not line.take(now):
+            client.give_back(1)
+            own.give_back(1)
+            return "line"
         return None

@@ -31,6 +31,7 @@ from gateway.core.fairness import FairQueue
 from gateway.core.health import Breaker
 from gateway.core.requests import ClientRead, Lane, PollItem, Purpose, ReadTurn, Span, Turn, Waiter, WriteTurn
 from gateway.core.site import Device
+from gateway.core.turns import clients_of
 from gateway.core.under_way import UnderWay
 from gateway.devices.model import Space
 from gateway.devices.plan import limit as protocol_limit
@@ -132,8 +133,7 @@ class Scheduler:
 
     def charge(self, turn: ReadTurn, seconds: float) -> None:
         """Book the line time of a finished read on its clients."""
-        clients = list(dict.fromkeys(waiter.client for read in turn.reads for waiter in read.waiters))
-        self._queue(turn.lane).charge(clients, seconds)
+        self._queue(turn.lane).charge(clients_of(turn), seconds)
 
     def expired(self, now: float) -> list[Waiter]:
         """Take out the askers of client reads that waited too long."""
@@ -227,9 +227,11 @@ class Scheduler:
     def _join(self, head: ClientRead) -> ReadTurn:
         queue = self._queue(head.lane)
         polls = self._polls[head.device.unit_id]
-        span, reads = join(
-            head, queue.of_device(head.device), cost=self._cost, mapped=head.device.map.covers, most=polls.most_in
-        )
+        others = queue.of_device(head.device)
+        span = head.span
+        reads: tuple[ClientRead, ...] = (head,)
+        if len(others) > 1:
+            span, reads = join(head, others, cost=self._cost, mapped=head.device.map.covers, most=polls.most_in)
         for read in reads:
             queue.take(read)
         pdu = head.pdu

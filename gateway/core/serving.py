@@ -106,7 +106,7 @@ class Serving:
             return
         self._forget_other_stretches(self.device.snapshot)
         for block in tuple(self._client_blocks):
-            if (block.space, block.first, block.count) == (space, read.address, read.count):
+            if block.first == read.address and block.count == read.count and block.space is space:
                 if block.read_at >= ask.asked_at:
                     return
                 self._client_blocks.remove(block)

@@ -1,7 +1,8 @@
 """Turns that come before anything that the scheduler has.
 
 Rule 1: a turn whose device must first answer the question that settles its missed replies (doubt.py) is held. It goes
-        on when that was answered; a poll is let go instead, for it is due still, if it is still wanted.
+        on when that was answered, if it is still wanted; a poll that was not begun is let go instead, for it is due
+        still.
 Rule 2: turns that ended through no fault of their own are made again, once, before anything else. The first of them
         has the line to itself: nothing else begins before it has ended. So a server that does not stand company is
         found out, and when it is one device's silence that took the others with it, that shows too.
@@ -58,7 +59,7 @@ class SetAside:
     def settled(self, turn: Turn) -> None:
         """The question of that turn's device was answered."""
         held = self._held.get(turn.device.unit_id)
-        if isinstance(held, PollItem):
+        if isinstance(held, PollItem) and not held.again:
             self.forget(held)
 
     def unsettled(self, turn: Turn) -> Turn | None:

@@ -22,7 +22,8 @@ class UpstreamSettings:
 
     host: str
     port: int
-    pipelining: int = 8  # how many requests may be under way at once; fewer where the server does not stand it
+    pipelining: int = 8  # how many requests may be under way on a connection; fewer where the server does not stand it
+    connections: int = 1  # how many there may be side by side; fewer where the server does not stand it
     connect_timeout_s: float = 3.0
 
 

@@ -29,8 +29,18 @@ def is_wanted(turn: Turn) -> bool:
 def waiters_of(turn: Turn) -> list[Waiter]:
     """Who waits for it; nobody for a poll."""
     if isinstance(turn, ReadTurn):
+        if len(turn.reads) == 1:
+            return turn.reads[0].waiters
         return [waiter for read in turn.reads for waiter in read.waiters]
     return [turn.waiter] if isinstance(turn, WriteTurn) else []
+
+
+def clients_of(turn: Turn) -> list[str]:
+    """Who asked for it, each client once; nobody for a poll."""
+    waiters = waiters_of(turn)
+    if len(waiters) == 1:
+        return [waiters[0].client]
+    return list(dict.fromkeys(waiter.client for waiter in waiters))
 
 
 def part_of(turn: ReadTurn, read: ClientRead, reply: bytes) -> bytes:

@@ -45,11 +45,13 @@ class UnderWay:
         unit = turn.device.unit_id
         self._sent[key] = Sent(turn, now)
         self._counts[unit] = self._counts.get(unit, 0) + 1
-        if closed or isinstance(turn, WriteTurn) or turn.purpose is Purpose.SETTLE:
+        if closed or isinstance(turn, WriteTurn):
             self._closed.add(unit)
         self.alone = alone
         if isinstance(turn, PollItem):
             turn.under_way = True
+            if turn.purpose is Purpose.SETTLE:
+                self._closed.add(unit)
 
     def end(self, key: int) -> Sent:
         """It has ended."""

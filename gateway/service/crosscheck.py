@@ -26,7 +26,7 @@ from gateway.service.writes import rule_problems
 Raw = Mapping[str, object]
 
 SERIAL_KEYS = ("baudrate", "bytesize", "parity", "stopbits", "quarantine_s", "gap_s")
-UPSTREAM_KEYS = ("pipelining", "connect_timeout_s")
+UPSTREAM_KEYS = ("pipelining", "connections", "connect_timeout_s")
 
 
 def cross_problems(raw: Raw) -> list[Problem]:

@@ -173,9 +173,18 @@ class LineTable(Table):
         int,
         Key(
             "1 to 32; tcp:// only",
-            "How many requests may be under way at once, if the server stands it; 1 sends one after the other.",
+            "How many requests may be under way at once on a connection, if the server stands it; "
+            "1 sends one after the other.",
         ),
     ] = Field(default=_UPSTREAM.pipelining, ge=1, le=32)
+    connections: Annotated[
+        int,
+        Key(
+            "1 to 8; tcp:// only",
+            "How many connections there may be side by side, when requests wait and the server stands it; "
+            "for a converter or gateway that closes after every reply.",
+        ),
+    ] = Field(default=_UPSTREAM.connections, ge=1, le=8)
     connect_timeout_s: Annotated[
         Seconds,
         Key("0.1 to 60.0; tcp:// only", "How long a connection may take, name lookup included."),

@@ -63,7 +63,13 @@ def _upstream(line: LineTable) -> UpstreamSettings | None:
     parts = urlsplit(line.port)
     if parts.scheme != "tcp" or parts.hostname is None or parts.port is None:
         return None
-    return UpstreamSettings(parts.hostname, parts.port, line.pipelining, line.connect_timeout_s)
+    return UpstreamSettings(
+        parts.hostname,
+        parts.port,
+        pipelining=line.pipelining,
+        connections=line.connections,
+        connect_timeout_s=line.connect_timeout_s,
+    )
 
 
 def line_sites(config: Config) -> dict[str, str]:

@@ -88,6 +88,7 @@ class _Peer(asyncio.Protocol):
             return
         self._connection = self._owner.server.connect()
         self._owner.came(self)
+        self._serve()
 
     def data_received(self, data: bytes) -> None:
         if self._connection is not None:

@@ -5,8 +5,8 @@ Rule 1: stations answer under their addresses as unit ids. They hang on one EIA-
     whichever connection.
 Rule 2: a unit that is not there, or does not answer, is waited for `patience_s`; then `silence` is the exception that
     the client gets, None for no answer at all.
-Rule 3: habits: it may close each connection after one reply, as a TriStar does, or throw away what comes while it
-    works on something of the same connection.
+Rule 3: habits: it may close each connection after one reply, as a TriStar does, throw away what comes while it
+    works on something of the same connection, or admit only so many connections at once.
 Rule 4: replies keep the order of the requests of their connection, unless chaos says otherwise (tcp_chaos.py).
 
 Nothing here does input or output or reads a clock: `connect`, `receive` bytes, ask `next_event`, `take` at that time.
@@ -34,6 +34,7 @@ class Habits:
 
     closes: bool = False  # after every reply
     one_at_a_time: bool = False  # what comes while it works on a request of the connection is thrown away
+    admits: int | None = None  # connections at once; a further one is closed unasked
     silence: int | None = 0x0B
     patience_s: float = 0.3
     latency_s: float = 0.0  # of the network, there and back
@@ -106,7 +107,8 @@ class SimulatedServer:
         self.counters.connections += 1
         self.counters.open_connections += 1
         self.counters.most_open = max(self.counters.most_open, self.counters.open_connections)
-        return ServerConnection(self)
+        admits = self.habits.admits
+        return ServerConnection(self, unwanted=admits is not None and self.counters.open_connections > admits)
 
     def work(self, adu: Adu, now: float) -> tuple[float, bytes | None]:
         """When a request that came at `now` is answered, and the reply PDU; None: never."""
@@ -136,7 +138,7 @@ class _Due:
 class ServerConnection:
     """One connection. `ended` is "" while it lasts, else "fin" or "reset": the client sees that after the bytes."""
 
-    def __init__(self, server: SimulatedServer) -> None:
+    def __init__(self, server: SimulatedServer, *, unwanted: bool = False) -> None:
         self.ended = ""
         self._server = server
         self._splitter = MbapSplitter()
@@ -144,6 +146,8 @@ class ServerConnection:
         self._number = 0
         self._waiting: set[int] = set()
         self._stuck = False
+        if unwanted:
+            self._due.append(_Due(-math.inf, 0, Piece(-math.inf, b"", "fin")))
 
     def receive(self, data: bytes, now: float) -> None:
         """Take bytes that the client wrote; they arrive at once, and half of the latency later in effect."""

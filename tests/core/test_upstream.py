@@ -21,6 +21,7 @@ from tests.core.virtual_upstream import VirtualUpstream, make_upstream
 from tests.faults.rig import oracle_map
 
 QUIET = PollSettings(live_s=3600.0, settings_s=3600.0)
+BUSY = PollSettings(live_s=0.2, settings_s=3600.0)
 
 
 class Unit(Registers):
@@ -42,12 +43,17 @@ class Unit(Registers):
 
 
 def line(
-    *units: Unit, habits: Habits | None = None, run_s: float = 2.0, pipelining: int = 8, **settings: object
+    *units: Unit,
+    habits: Habits | None = None,
+    run_s: float = 2.0,
+    pipelining: int = 8,
+    connections: int = 1,
+    **settings: object,
 ) -> VirtualUpstream:
     server = SimulatedServer(units, habits=habits or Habits(latency_s=0.05))
     devices = [Device(f"array-{u.address}", 10 + u.address, u.address, oracle_map()) for u in units]
     settings.setdefault("poll", QUIET)
-    rig = make_upstream(server, devices, pipelining=pipelining, **settings)
+    rig = make_upstream(server, devices, pipelining=pipelining, connections=connections, **settings)
     rig.run(run_s)
     return rig
 
@@ -73,6 +79,36 @@ def test_requests_overlap_as_far_as_the_window_allows() -> None:
     assert len(outcomes) == 16, f"two windows of 8, 50 ms each; {rig.now - began}"
     assert rig.most_under_way == 8
     assert rig.engine.stats.opens == rig.engine.upstream.connections == 1
+
+
+def test_a_server_that_closes_is_asked_over_several_connections_where_that_is_configured() -> None:
+    took: dict[int, float] = {}
+    for connections in (1, 4):
+        rig = line(
+            Unit(1), Unit(2), habits=Habits(closes=True, latency_s=0.05), connections=connections, run_s=5.0, poll=BUSY
+        )
+        outcomes, others = ask_many(rig, 16), ask_many(rig, 16, unit=1)
+        began = rig.now
+        while len(outcomes) + len(others) < 32:
+            rig.run(0.01)
+        took[connections] = rig.now - began
+        rig.run(2.0)
+        assert rig.server.counters.most_open == rig.most_under_way == connections
+        assert set(rig.engine.stats.failed) <= {"exception"}
+        assert set(rig.engine.upstream.lost) == {"finished"}
+        assert states(rig) == [DeviceState.ONLINE] * 2
+    assert took[4] < took[1] / 2
+
+
+def test_a_server_that_admits_one_connection_goes_on_with_it() -> None:
+    rig = line(Unit(1), Unit(2), habits=Habits(latency_s=0.05, admits=1), connections=4, pipelining=1)
+    outcomes = ask_many(rig, 16)
+    rig.run(3.0)
+    assert [type(outcome) for outcome in outcomes] == [bytes] * 16
+    assert rig.engine.stats.failed["connection_lost"] == 1, "and that one was made again"
+    assert [device.stats.failures for device in rig.devices] == [0, 0]
+    assert rig.engine.upstream.window == 1
+    assert states(rig) == [DeviceState.ONLINE] * 2
 
 
 def test_without_pipelining_one_follows_the_other() -> None:
@@ -107,16 +143,18 @@ def test_each_second_of_the_line_is_booked_once() -> None:
     assert stats.seconds_by_purpose["client"] < 0.5, "40 reads of 50 ms each, eight at a time"
 
 
-def test_a_write_is_alone_with_its_device_and_no_read_brings_the_old_value_back() -> None:
+@pytest.mark.parametrize(("closes", "connections"), [(False, 1), (False, 3), (True, 1), (True, 4)])
+def test_a_write_is_alone_with_its_device_and_no_read_brings_the_old_value_back(closes: bool, connections: int) -> None:
     unit, other = Unit(1), Unit(2)
-    rig = line(unit, other, writes=True)
+    habits = Habits(closes=closes, latency_s=0.05)
+    rig = line(unit, other, writes=True, habits=habits, connections=connections, poll=BUSY, run_s=5.0)
     outcomes = ask_many(rig, 6)
     others = ask_many(rig, 2, unit=1)
     written: list[Outcome] = []
     rig.engine.write(rig.devices[0], bytes.fromhex("06E0000007"), written.append, rig.now, client="")
     after: list[Outcome] = []
     rig.read(0, registers(0xE000, 2), after.append)
-    rig.run(1.0)
+    rig.run(3.0)
     assert written == [bytes.fromhex("06E0000007")]
     assert isinstance(after[0], bytes)
     assert after[0][2:4] == b"\0\7"
@@ -126,6 +164,7 @@ def test_a_write_is_alone_with_its_device_and_no_read_brings_the_old_value_back(
     write_at = next(at for at, adu in times if adu.pdu[0] == 6)
     around = [at for at, adu in times if adu.pdu[0] != 6 and abs(at - write_at) < 0.049]
     assert not around, "nothing of the device overlaps with it"
+    assert Counter(adu.pdu[0] for _, adu in rig.sent)[6] == 1
 
 
 def test_a_dead_device_behind_a_gateway_costs_the_others_nothing() -> None:

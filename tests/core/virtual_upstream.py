@@ -16,6 +16,7 @@ from gateway.modbus.mbap import Adu, MbapSplitter
 from gateway.simulator.upstream import ServerConnection, SimulatedServer
 
 RECONNECT_S = 0.002
+FEWER_S = 1.0
 
 
 class VirtualUpstream:
@@ -29,8 +30,10 @@ class VirtualUpstream:
         self.sent: list[tuple[float, Adu]] = []
         self.most_under_way = 0
         self.after_step: Callable[[], None] = lambda: None
-        self._connection: ServerConnection | None = None
+        self._connections: dict[int, ServerConnection] = {}
         self._connect_at = self.now
+        self._no_more_before = -math.inf
+        self._asked: set[int] = set()  # the connections that something went out on
         self._open = False
 
     def run(self, seconds: float) -> None:
@@ -39,23 +42,22 @@ class VirtualUpstream:
         while True:
             self._connect()
             self._write()
-            connection = self._connection
-            moments = [self.engine.next_deadline(self.now), math.inf if connection else self._connect_at]
-            moments.append(connection.next_event() if connection else None)
+            moments = [self.engine.next_deadline(self.now), math.inf if self._connections else self._connect_at]
+            moments += [connection.next_event() for connection in self._connections.values()]
             moment = min(moment for moment in moments if moment is not None)
             if moment > end:
                 self.now = end
                 return
             self.now = max(self.now, moment)
-            if connection is not None:
+            for number, connection in list(self._connections.items()):
                 data = connection.take(self.now)
                 if data:
-                    self.engine.receive(data, self.now)
+                    self.engine.receive(data, self.now, number)
                 if connection.ended:
-                    self._lose(remote=True)
+                    self._lose(number, remote=True)
             self.engine.on_timer(self.now)
-            if self.engine.drop is not None:
-                self._lose(remote=False)
+            for number, _ in self.engine.drops():
+                self._lose(number, remote=False)
             self.after_step()
 
     def read(
@@ -77,8 +79,9 @@ class VirtualUpstream:
         return self._await(outcomes, wait_s)
 
     def reset(self) -> None:
-        """The connection breaks now."""
-        self._lose(remote=True)
+        """The connections break now."""
+        for number in list(self._connections):
+            self._lose(number, remote=True)
 
     def units_asked(self) -> Counter[int]:
         """How many requests went out to each unit."""
@@ -92,7 +95,7 @@ class VirtualUpstream:
         return outcomes[0]
 
     def _connect(self) -> None:
-        if self._connection is not None or self.now < self._connect_at:
+        if self._connections or self.now < self._connect_at:
             return
         if self.server.refusing:
             if self._open:
@@ -100,37 +103,53 @@ class VirtualUpstream:
                 self._open = False
             self._connect_at = self.now + 0.5
             return
-        self._connection = self.server.connect()
+        self._connections[0] = self.server.connect()
         if self._open:
             self.engine.connected(self.now)
         else:
             self.engine.opened(self.now)
             self._open = True
 
-    def _lose(self, *, remote: bool) -> None:
-        if self._connection is not None:
-            self._connection.client_closed()
-        self._connection = None
+    def _connect_more(self) -> bool:
+        """One more connection, where a request waits for it."""
+        if not self._connections or self.now < self._no_more_before or not self.engine.lacks_connection(self.now):
+            return False
+        number = next(number for number in range(len(self._connections) + 1) if number not in self._connections)
+        self._connections[number] = self.server.connect()
+        self.engine.connected(self.now, number)
+        return True
+
+    def _lose(self, number: int, *, remote: bool) -> None:
+        connection = self._connections.pop(number, None)
+        if connection is not None:
+            connection.client_closed()
+        self.engine.lost(self.now, remote=remote, channel=number)
+        if number not in self._asked:
+            self._no_more_before = self.now + FEWER_S
+        self._asked.discard(number)
+        if self._connections:
+            return
         self._connect_at = self.now + RECONNECT_S
-        self.engine.lost(self.now, remote=remote)
         if self.engine.silent:
             self.engine.closed("silent", self.now)
             self._open = False
             self._connect_at = self.now + 0.5
 
     def _write(self) -> None:
-        while (frame := self.engine.step(self.now)) is not None:
+        while (frame := self.engine.step(self.now)) is not None or self._connect_more():
+            if frame is None:
+                continue
             self.sent += [(self.now, adu) for adu in MbapSplitter().feed(frame)]
-            assert self._connection is not None, "nothing goes out without a connection"
-            self._connection.receive(frame, self.now)
+            self._asked.add(self.engine.sent_on)
+            self._connections[self.engine.sent_on].receive(frame, self.now)
         stats = self.engine.stats
         self.most_under_way = max(self.most_under_way, stats.sent - stats.ok - stats.failed.total())
 
 
 def make_upstream(
-    server: SimulatedServer, devices: Sequence[Device], *, pipelining: int = 8, **settings: Any
+    server: SimulatedServer, devices: Sequence[Device], *, pipelining: int = 8, connections: int = 1, **settings: Any
 ) -> VirtualUpstream:
     """An engine with these devices on that server; `settings` are those of LineSettings."""
-    upstream = UpstreamSettings("virtual", 502, pipelining=pipelining)
+    upstream = UpstreamSettings("virtual", 502, pipelining=pipelining, connections=connections)
     line = LineSettings(name="line", index=1, port="tcp://virtual:502", upstream=upstream, **settings)
     return VirtualUpstream(server, devices, line)

@@ -39,7 +39,13 @@ def devices(count: int) -> list[Device]:
 
 
 def line_to(host: str, port: int, units: list[Device], **settings: Any) -> UpstreamLine:
-    upstream = UpstreamSettings(host, port, connect_timeout_s=settings.pop("connect_timeout_s", 2.0))
+    upstream = UpstreamSettings(
+        host,
+        port,
+        pipelining=settings.pop("pipelining", 8),
+        connections=settings.pop("connections", 1),
+        connect_timeout_s=settings.pop("connect_timeout_s", 2.0),
+    )
     settings = {"poll": FAST, "reply_timeout_s": 0.3, **settings}
     where = f"tcp://{host}:{port}"
     return UpstreamLine(LineSettings("site-a", 1, where, upstream=upstream, **settings), units, SystemClock())
@@ -109,12 +115,43 @@ async def test_a_server_that_closes_after_every_reply_gives_no_error_and_no_paus
         for k in range(30):
             assert isinstance(await ask(line, units[k % 2]), bytes)
         assert watch.s < 3.0
-        assert set(line.stats.failed) <= {"connection_lost", "exception"}
-        assert line.stats.failed["connection_lost"] <= 2, "until its habit is known"
+        assert set(line.stats.failed) <= {"exception"}, "its habit is learnt without losing a request"
+        assert line.stats.upstream is not None
+        assert set(line.stats.upstream.lost) == {"finished"}
         assert line.stats.opens == 1
         assert simulated.counters.most_open <= 2, "the next may come in before the last is gone"
         await until(lambda: simulated.counters.open_connections <= 1)
         assert all_online(units)
+
+
+async def test_a_server_that_closes_is_asked_over_several_connections_at_once() -> None:
+    units = devices(3)
+    simulated = SimulatedServer(controllers(3), habits=Habits(closes=True))
+    async with (
+        TcpServer(simulated) as server,
+        running(line_to("127.0.0.1", server.port, units, connections=4)) as line,
+    ):
+        await until(lambda: all_online(units))
+        for _ in range(10):
+            replies = await asyncio.gather(*(ask(line, units[k % 3], 5 * k, 5) for k in range(12)))
+            assert all(isinstance(reply, bytes) and reply[0] == 3 for reply in replies)
+        assert 1 < simulated.counters.most_open <= 8, "the next may come in before the last is gone"
+        assert set(line.stats.failed) <= {"exception"}
+
+
+async def test_a_further_connection_that_is_not_to_be_had_is_done_without() -> None:
+    units = devices(2)
+    simulated = SimulatedServer(controllers(2), habits=Habits(latency_s=0.01, admits=1))
+    async with TcpServer(simulated) as server:
+        line = line_to("127.0.0.1", server.port, units, connections=4, pipelining=1)
+        async with running(line):
+            await until(lambda: all_online(units))
+            for _ in range(20):
+                replies = await asyncio.gather(*(ask(line, units[k % 2], 10 * k) for k in range(6)))
+                assert all(isinstance(reply, bytes) for reply in replies)
+            assert line.stats.opens == 1
+            assert line.stats.upstream is not None
+            assert line.stats.upstream.connections < 10, "it is not stormed"
 
 
 async def test_a_refused_connection_takes_the_line_down_and_it_recovers_alone(

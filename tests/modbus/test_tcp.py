@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from gateway.errors import ConnectionLost, IllegalDataValue, ReplyMismatch, ReplyTimeout
 from gateway.modbus.counters import RtuCounters, UpstreamCounters
+from gateway.modbus.habits import CLOSES_WITHIN_S, LOOK_AGAIN_S
 from gateway.modbus.mbap import encode
 from gateway.modbus.pdu import Function, ReadRequest, is_exception, reply_fits
-from gateway.modbus.tcp import CLOSES_WITHIN_S, FINISHED, LOOK_AGAIN_S, TcpClient
+from gateway.modbus.tcp import FINISHED, TcpClient
 from gateway.modbus.transactions import Ended, Failed, Replied
 
 TIMEOUT_S = 1.0
@@ -36,10 +37,15 @@ def reply(pdu: bytes, seed: int = 0) -> bytes:
 class Client:
     """A client with its counters, connected."""
 
-    def __init__(self, most: int = 8, first_tid: int = 100) -> None:
+    def __init__(self, most: int = 8, first_tid: int = 100, connections: int = 1, *, known: bool = True) -> None:
         self.wire = RtuCounters()
         self.upstream = UpstreamCounters()
-        self.tcp = TcpClient(self.wire, self.upstream, most=most, first_tid=lambda: first_tid)
+        self.tcp = TcpClient(self.wire, self.upstream, most=most, first_tid=lambda: first_tid, connections=connections)
+        if known:  # to keep its connections
+            self.tcp.connected(-10.0)
+            self.exchange(now=-10.0)
+            self.exchange(now=-9.0)
+            self.tcp.lost(-9.0, remote=False)
         self.tcp.connected(0.0)
 
     def send(self, unit: int = 1, pdu: bytes | None = None, now: float = 0.0) -> tuple[int, bytes]:
@@ -138,6 +144,19 @@ def test_a_reply_that_lost_its_end_is_not_made_whole_by_the_next() -> None:
     assert client.tcp.drop is not None
 
 
+@pytest.mark.parametrize("together", [True, False])
+def test_a_reply_that_lost_its_end_is_not_made_whole_by_all_of_the_next(together: bool) -> None:
+    client = Client()
+    client.widen()
+    one, two = client.send(pdu=request(1, 82)), client.send(pdu=request(0x20, 1, Function.READ_COILS))
+    next_whole = encode(two[0], 1, b"\1\1\0")
+    torn = encode(one[0], 1, reply(one[1]))[: -len(next_whole)]
+    pieces = [torn + next_whole] if together else [torn, next_whole]
+    assert [ended for piece in pieces for ended in client.tcp.receive(piece, 0.1)] == []
+    assert client.tcp.drop == "length"
+    assert kinds(client.tcp.lost(0.2, remote=False)) == ["connection_lost"] * 2
+
+
 def test_a_late_reply_is_thrown_away_where_later_ones_were_answered() -> None:
     client = Client()
     client.widen()
@@ -205,7 +224,7 @@ def test_who_is_to_blame() -> None:
     client.send()
     assert blame(client.tcp.lost(0.0, remote=True)) == [True], "it was the first on its connection, and alone"
     client.tcp.connected(0.0)
-    client.exchange()
+    client.exchange(2)
     client.send()
     assert blame(client.tcp.lost(0.0, remote=True)) == [False], "the connection had answered before"
     client.tcp.connected(0.0)
@@ -234,12 +253,13 @@ def test_a_request_that_is_answered_only_alone_closes_the_window() -> None:
 
 
 def test_a_server_that_closes_after_every_reply_is_asked_once_a_connection() -> None:
-    client = Client()
+    client = Client(known=False)
     for _ in range(2):
         client.exchange()
-        assert client.tcp.ready_at(0.0) == 0.0, "its habit is not known yet"
-        client.tcp.lost(0.0, remote=True)
+        assert client.tcp.ready_at(0.0) == CLOSES_WITHIN_S, "its habit is not known yet, and nothing is risked"
+        assert not client.tcp.lost(0.0, remote=True), "nothing is lost by learning it"
         client.tcp.connected(0.0)
+    assert client.upstream.lost == {"finished": 2}
     client.exchange()
     assert client.tcp.ready_at(0.0) == math.inf
     assert not client.tcp.drop, "closing is left to the server"
@@ -248,7 +268,8 @@ def test_a_server_that_closes_after_every_reply_is_asked_once_a_connection() -> 
     assert client.tcp.drop == FINISHED
     client.tcp.lost(1.0, remote=False)
     client.tcp.connected(LOOK_AGAIN_S + 1.0)
-    client.exchange(3, now=LOOK_AGAIN_S + 1.0)
+    client.exchange(now=LOOK_AGAIN_S + 1.0)
+    client.exchange(2, now=LOOK_AGAIN_S + 1.0 + CLOSES_WITHIN_S)
     client.tcp.lost(LOOK_AGAIN_S + 2.0, remote=True)
     client.tcp.connected(LOOK_AGAIN_S + 2.0)
     client.exchange(3, now=LOOK_AGAIN_S + 2.0)

@@ -113,6 +113,7 @@ name = "ridge-08"
 port = "tcp://[2001:db8::8]:1502"
 site = "ridge-08"
 pipelining = 3
+connections = 4
 connect_timeout_s = 7.5
 [[line.device]]
 name = "far"
@@ -122,7 +123,9 @@ model = "prostar-mppt"
 """
     config = parse_config(TEXT.replace("[modbus]", f"{upstream}\n[modbus]", 1))
     settings = line_settings(config)
-    assert settings[2].upstream == UpstreamSettings("2001:db8::8", 1502, 3, 7.5)
+    assert settings[2].upstream == UpstreamSettings(
+        "2001:db8::8", 1502, pipelining=3, connections=4, connect_timeout_s=7.5
+    )
     assert [line.upstream for line in settings[:2]] == [None, None]
     site = Gateway(config, SystemClock()).site
     assert [site.of_line(line.name) for line in site.lines] == ["ridge-07", "ridge-07", "ridge-08"]

@@ -302,8 +302,9 @@ class Connection(asyncio.Protocol):
             self._write(b"".join(out))  # may call pause_writing
         if self.client.pause_s:
             self._pause()
-        if self._due or self._resume is not None:
             self._settle()
+        elif self._due:
+            self._direct = False
 
     def _pause(self) -> None:
         """Rule 4."""
@@ -399,11 +400,13 @@ class Connection(asyncio.Protocol):
         due.reply = self._dispatcher.conclude(due.waiting, self.client, outcome)
         if due is not self._due[0]:
             return
+        if len(self._due) == 1 and self._reading and not (self._adus or self._input or self._ending or self._suspect):
+            self._due.clear()
+            self._write(due.tid + due.reply)  # may call pause_writing
+            self._direct = self._unsent_since is None and self._resume is None and not self._splitter.pending
+            return
         self._send_due()
-        if self._adus or self._input:
-            self._work()
-        else:
-            self._settle()
+        self._work()
 
     def _send_due(self) -> None:
         """Send the replies whose turn it is (rule 1), if the client takes any (rule 2)."""

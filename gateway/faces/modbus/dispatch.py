@@ -9,6 +9,7 @@ exception; an exception that ends a forwarded request is counted under its code 
 from __future__ import annotations
 
 import logging
+import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -36,6 +37,7 @@ logger = logging.getLogger(__name__)
 
 _OWN_LIMITS = (CLIENT, CLIENT_LINE)
 
+_KEY = struct.Struct(">HHB")
 _UNIT_AT = 4  # of an ADU without its transaction id
 BROADCAST = 0
 RESERVED = range(248, 255)
@@ -154,7 +156,7 @@ class Dispatcher:
             return self.refuse(unit, pdu, client, self._limited(client, CLIENT, now))
         client.left -= 1
         client.slow += 1
-        request = mbap.encode(0, unit, pdu)[2:]
+        request = _KEY.pack(0, len(pdu) + 1, unit) + pdu
         entry = self.hot.find(request)
         if entry is not None and now < entry[0] and entry[1].snapshot.mark is entry[2]:
             self.stats.cache_hits += 1
@@ -206,7 +208,7 @@ class Dispatcher:
         if is_exception(outcome):
             self.stats.exceptions[outcome[1]] += 1
             client.exceptions[outcome[1]] += 1
-        return mbap.encode(0, waiting.unit, outcome)[2:]
+        return _KEY.pack(0, len(outcome) + 1, waiting.unit) + outcome
 
     def _answer_myself(self, own: StatusRegisters, pdu: bytes, requester: Requester, now: float) -> bytes:
         decision = decide(pdu[0], FUNCTIONS)

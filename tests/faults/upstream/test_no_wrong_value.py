@@ -35,9 +35,10 @@ def test_under_one_kind_of_fault(fault: TcpFault) -> None:
     assert rig.chaos.counts[fault] > 10
 
 
+@pytest.mark.parametrize("connections", [1, 4])
 @pytest.mark.parametrize("habits", HABITS)
-def test_it_recovers_alone(habits: str) -> None:
-    rig = storm(TcpChaos(7, dict.fromkeys(TcpFault, 0.05)), 60, HABITS[habits])
+def test_it_recovers_alone(habits: str, connections: int) -> None:
+    rig = storm(TcpChaos(7, dict.fromkeys(TcpFault, 0.05)), 60, HABITS[habits], connections=connections)
     rig.chaos.stop()
     rig.line.run(75.0)
     assert [device.snapshot.state for device in rig.devices] == [DeviceState.ONLINE] * 3
@@ -50,6 +51,10 @@ def test_it_recovers_alone(habits: str) -> None:
     habits=st.sampled_from(sorted(HABITS)),
     retries=st.integers(0, 3),
     pipelining=st.sampled_from((1, 2, 8, 32)),
+    connections=st.sampled_from((1, 2, 4)),
 )
-def test_under_any_mixture(seed: int, rates: dict[TcpFault, float], habits: str, retries: int, pipelining: int) -> None:
-    storm(TcpChaos(seed, rates), 25, HABITS[habits], retries=retries, pipelining=pipelining)
+def test_under_any_mixture(
+    *, seed: int, rates: dict[TcpFault, float], habits: str, retries: int, pipelining: int, connections: int
+) -> None:
+    chaos = TcpChaos(seed, rates)
+    storm(chaos, 25, HABITS[habits], retries=retries, pipelining=pipelining, connections=connections)

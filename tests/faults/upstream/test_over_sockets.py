@@ -25,14 +25,15 @@ from tests.lines.rig import until
 READS = 120
 
 
-@pytest.mark.parametrize("habits", [Habits(), Habits(closes=True)], ids=["keeps", "closes"])
-async def test_no_wrong_value(habits: Habits) -> None:
+@pytest.mark.parametrize(("closes", "connections"), [(False, 1), (False, 3), (True, 1), (True, 4)])
+async def test_no_wrong_value(closes: bool, connections: int) -> None:
+    habits = Habits(closes=closes)
     chaos = TcpChaos(5, dict.fromkeys(TcpFault, 0.01), delay_s=(0.005, 0.03), late_s=(0.2, 0.5))
     units = [Unit(0, turnaround_s=0.001), Unit(1, turnaround_s=0.001)]
     devices = [Device(f"array-{n}", 10 + n, unit.address, oracle_map()) for n, unit in enumerate(units, 1)]
     rng = Random(5)
     async with TcpServer(SimulatedServer(units, habits=habits, spoiler=chaos)) as server:
-        upstream = UpstreamSettings("127.0.0.1", server.port)
+        upstream = UpstreamSettings("127.0.0.1", server.port, connections=connections)
         poll = PollSettings(live_s=0.3, settings_s=2.0)
         settings = LineSettings("line", 1, server.url, reply_timeout_s=0.15, poll=poll, upstream=upstream)
         line = UpstreamLine(settings, devices, SystemClock(), Random(1))
