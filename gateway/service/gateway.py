@@ -258,6 +258,7 @@ class Gateway:
             clients=self._modbus.clients,
             days=None if days is None else days.days,
             before=before,
+            give_way=self._modbus.hub.serve,
         )
 
     def _log_keeper(

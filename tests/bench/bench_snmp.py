@@ -9,7 +9,8 @@ together is a walk. SNMPv3 is authPriv with SHA-256 and AES-128. One reply a run
 
 Then the longest CPU time for which the SNMP face held the event loop, while its whole tree (every table, not only
 the 80 columns) is walked by GETBULK-50 from one OID to the next, the first time and again; and Modbus TCP's latency,
-alone and while the 80 columns are walked without a pause.
+alone and while the 80 columns are walked and /metrics is scraped without a pause, all by one load generator
+(modbus_load.c).
 """
 
 from __future__ import annotations
@@ -41,6 +42,8 @@ from tests.bench.bench_modbus_tcp import HERE, compiled, cpu_s, free_port, say, 
 from tests.bench.snmp_server import BENCH, MODEL, UNITS
 
 COLUMNS = 80
+WALKERS = 8
+BESIDE = "beside"
 REPETITIONS = 50
 START_S = 15.0
 REFERENCE = "snmpd"
@@ -86,6 +89,7 @@ class Server:
     process: subprocess.Popen[bytes]
     port: int
     modbus_port: int
+    http_port: int
     cells: tuple[Oid, ...]
 
 
@@ -203,7 +207,7 @@ def snmpd_cells() -> tuple[Oid, ...]:
 
 def started(name: str, folder: Path, core: int) -> Server:
     """Start one server on a core; returns when it answers."""
-    port, modbus_port = free_port(), free_port()
+    port, modbus_port, http_port = free_port(), free_port(), free_port()
     environment = dict(os.environ)
     if name == REFERENCE:
         table = folder / "snmp_table.so"
@@ -217,12 +221,12 @@ def started(name: str, folder: Path, core: int) -> Server:
         cells = snmpd_cells()
     else:
         loop = name.rpartition(" ")[2]
-        command = [sys.executable, "-m", "tests.bench.snmp_server", str(port), str(modbus_port), loop]
+        command = [sys.executable, "-m", "tests.bench.snmp_server", str(port), str(modbus_port), str(http_port), loop]
         cells = gateway_cells()
     process = subprocess.Popen(
         ["taskset", "-c", str(core), *command], env=environment, cwd=HERE.parents[1], stdout=subprocess.PIPE
     )
-    server = Server(name, process, port, modbus_port, cells)
+    server = Server(name, process, port, modbus_port, http_port, cells)
     until = time.monotonic() + START_S
     with Asker(port) as asker:
         while True:
@@ -334,37 +338,42 @@ def whole_walk(server: Server, question: Question) -> str:
 
 
 def beside_modbus(server: Server, folder: Path, rounds: int, seconds: float, core: int) -> str:
-    """Modbus TCP latency of a server without and with a walk that never pauses: 16 clients, one request each."""
-    load = compiled("modbus_load.c", folder)
+    """Modbus TCP latency of a server, alone and while others ask who never pause: 16 clients, one request each."""
     walk = folder / "walk"
     requests(QUESTIONS[2], server, walk)
-    pin = ["taskset", "-c", str(core)]
-    modbus = [*pin, load, str(server.modbus_port), "16", "1", str(seconds), "8"]
-    found: dict[str, list[dict[str, float]]] = {"alone": [], "during a walk": []}
+    modbus = ["taskset", "-c", str(core), compiled("modbus_load.c", folder), str(server.modbus_port)]
+    modbus += ["16", "1", str(seconds), "8"]
+    walkers, scraper = [str(server.port), str(walk)], [str(server.http_port), "identity"]
+    beside_it = {
+        "alone": [],
+        "a walk": ["1", *walkers],
+        f"{WALKERS} walks": [str(WALKERS), *walkers],
+        "scrapes": ["0", *walkers, *scraper],
+        "a walk and scrapes": ["1", *walkers, *scraper],
+    }
+    found: dict[str, list[dict[str, float]]] = {name: [] for name in beside_it}
     for _ in range(rounds):
-        for name, results in found.items():
-            walker = None
-            if name != "alone":
-                command = [*pin, str(folder / "snmp_load"), str(server.port), "1", str(seconds + 1), str(walk)]
-                walker = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-                time.sleep(0.3)
-            done = subprocess.run(modbus, check=True, capture_output=True, text=True)
-            result = json.loads(done.stdout)
-            if walker is not None:
-                output, _ = walker.communicate()
-                walked = json.loads(output)
-                result["cells"] = walked["varbinds"] / walked["seconds"]
-            results.append(result)
-    lines = ["| Modbus TCP | replies/s | p50 µs | p99 µs | lost | cells/s walked |", "|" + "---|" * 6]
+        for name, others in beside_it.items():
+            done = subprocess.run([*modbus, *others], check=True, capture_output=True, text=True)
+            found[name].append(json.loads(done.stdout))
+    head = ["beside", "replies/s", "p50 µs", "p99 µs", "÷ alone", "lost", "wrong", "cells/s walked", "scrapes/s"]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for name, results in found.items():
-        rate = statistics.median(each["replies"] / each["seconds"] for each in results)
+        rates = {
+            key: statistics.median(each[key] / each["seconds"] for each in results)
+            for key in ("replies", "varbinds", "scrapes")
+        }
         p50, p99 = (statistics.median(each[key] for each in results) for key in ("p50_us", "p99_us"))
-        cells = statistics.median(each.get("cells", 0) for each in results)
-        lost = sum(each["lost"] for each in results)
-        lines.append(f"| {name} | {rate:,.0f} | {p50:,.0f} | {p99:,.0f} | {lost:.0f} | {cells:,.0f} |")
-    pairs = zip(found["alone"], found["during a walk"], strict=True)
-    ratio = statistics.median(walked["p99_us"] / alone["p99_us"] for alone, walked in pairs)
-    return "\n".join(lines) + f"\n\np99 during a walk ÷ alone: {ratio:.2f}"
+        ratio = statistics.median(
+            each["p99_us"] / alone["p99_us"] for each, alone in zip(results, found["alone"], strict=True)
+        )
+        lost = sum(each["lost"] + each["not_walked"] for each in results)
+        wrong = sum(each["wrong"] for each in results)
+        lines.append(
+            f"| {name} | {rates['replies']:,.0f} | {p50:,.0f} | {p99:,.0f} | {ratio:.2f} | {lost:.0f} | {wrong:.0f} "
+            f"| {rates['varbinds']:,.0f} | {rates['scrapes']:.0f} |"
+        )
+    return "\n".join(lines)
 
 
 def beside(server: Server, folder: Path, options: argparse.Namespace, usable: Sequence[int]) -> None:
@@ -385,7 +394,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1.0)
     parser.add_argument("--sockets", type=int, default=8)
     parser.add_argument(
-        "--only", nargs="+", metavar="QUESTION", help="ask only what has one of these words in its name"
+        "--only",
+        nargs="+",
+        metavar="QUESTION",
+        help=f"ask only what has one of these words in its name; {BESIDE}: what a walk does to others",
     )
     options = parser.parse_args()
     for tool in ("gcc", "taskset"):
@@ -425,7 +437,7 @@ def main() -> None:
                             measure(command, question, server, folder / f"{question.name} {server.port}")
                         )
             say(f"\n{question.name}\n\n{table(runs)}")
-        if not options.only:
+        if not options.only or BESIDE in options.only:
             beside(
                 servers[names.index("gateway, uvloop") if "gateway, uvloop" in names else 0], folder, options, usable
             )

@@ -1,4 +1,4 @@
-"""The SNMP face over memory, with the Modbus TCP face beside it: `snmp_server.py PORT MODBUS_PORT asyncio|uvloop`.
+"""The SNMP face over memory, Modbus TCP and HTTP beside it: `snmp_server.py PORT MODBUS_PORT HTTP_PORT asyncio|uvloop`.
 
 200 devices, every point with a value, snapshots replaced every second as polls do. The community is "public"; the
 user "bench" has SHA-256 and AES-128. The allowance of a source is out of the way; everything else is on.
@@ -25,6 +25,8 @@ from gateway.core.snapshot import Block, DeviceState, Snapshot
 from gateway.core.stats import ModbusServerStats
 from gateway.devices.model import DeviceMap, Space, Value
 from gateway.devices.schema import load_map
+from gateway.faces.http.app import HttpFace
+from gateway.faces.http.settings import HttpSettings
 from gateway.faces.modbus.server import ModbusServer
 from gateway.faces.modbus.settings import ModbusSettings
 from gateway.faces.snmp.agent import SnmpAgent
@@ -74,7 +76,7 @@ class Turns:
         self._longest_s = 0.0
 
 
-async def serve(port: int, modbus_port: int) -> None:
+async def serve(port: int, modbus_port: int, http_port: int) -> None:
     clock = SystemClock()
     line = NoLine()
     device_map = load_map(MODEL)
@@ -90,16 +92,20 @@ async def serve(port: int, modbus_port: int) -> None:
         requests_per_s=1e9,
     )
     conditions = Conditions(site, (), clock.monotonic())
-    agent = SnmpAgent(settings, site, clock, stats, conditions=conditions)
+    modbus = ModbusServer(ModbusSettings(listen=(("127.0.0.1", modbus_port),)), site, clock, stats)
+    agent = SnmpAgent(settings, site, clock, stats, conditions=conditions, give_way=modbus.hub.serve)
     turns = Turns(agent)
     agent.answer_waiting = turns.answer_waiting  # type: ignore[method-assign]
     asyncio.get_running_loop().add_signal_handler(signal.SIGUSR1, turns.tell)
-    modbus = ModbusServer(ModbusSettings(listen=(("127.0.0.1", modbus_port),)), site, clock, stats)
+    http = HttpFace(
+        HttpSettings(listen=(("127.0.0.1", http_port),)), site, clock, modbus=stats, snmp=dict, not_ready=tuple
+    )
     number = 0
     data = b"".join(at.to_bytes(2) for at in range(0x52))
     decoded = [values(device_map, at) for at in range(DECODED)]  # what decoding costs is not the face's
     await modbus.listeners[0].start()
     await agent.listeners[0].start()
+    await http.listeners[0].start()
     set_aside()  # as the gateway does once it has started
     while True:
         number += 1
@@ -121,9 +127,10 @@ async def serve(port: int, modbus_port: int) -> None:
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.ERROR)  # that a poller signs in would be told amid the tables
-    if sys.argv[3] == "uvloop":
+    serving = serve(int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]))
+    if sys.argv[4] == "uvloop":
         import uvloop
 
-        uvloop.run(serve(int(sys.argv[1]), int(sys.argv[2])))
+        uvloop.run(serving)
     else:
-        asyncio.run(serve(int(sys.argv[1]), int(sys.argv[2])))
+        asyncio.run(serving)

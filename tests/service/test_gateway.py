@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 import sys
 from ipaddress import ip_network
 from pathlib import Path
+from typing import cast
 
 import pytest
 
@@ -269,3 +271,36 @@ def test_an_emc1_view_has_a_port_of_its_own_where_somebody_may_read() -> None:
     ]
     nobody = parse_config(TEXT.partition("[[snmp.community]]")[0] + view)
     assert snmp_settings(nobody).emc1 == (Emc1Device(12),)
+
+
+class Flood:
+    """A UDP socket in which there is always one more datagram."""
+
+    def __init__(self) -> None:
+        self.sent = 0
+
+    def recvfrom(self, _size: int) -> tuple[bytes, tuple[str, int]]:
+        return b"\x30\x00", ("192.0.2.1", 161)
+
+    def sendto(self, _data: bytes, _address: object) -> None:
+        self.sent += 1
+
+
+async def test_a_modbus_client_is_served_in_the_middle_of_an_snmp_turn() -> None:
+    text = TEXT.replace(', "[::1]:0"', "").replace('allow = ["10.1.2.0/24", "10.9.9.9"]', "")
+    gateway = Gateway(parse_config(text), SystemClock())
+    listener = gateway.listeners[0]
+    await listener.start()
+    try:
+        assert listener.bound is not None
+        with socket.create_connection(listener.bound) as client:
+            async with asyncio.timeout(10):
+                while not gateway._modbus.stats.open_connections:  # noqa: ASYNC110  a counter sets no event
+                    await asyncio.sleep(0)
+            client.setblocking(False)
+            client.sendall(bytes.fromhex("0001 0000 0006 fe 03 0000 0001"))
+            gateway._snmp.answer_waiting(cast("socket.socket", Flood()))  # the loop has nothing to say in it
+            reply = client.recv(64)
+        assert (reply[:4], reply[6]) == (bytes.fromhex("0001 0000"), 0xFE)
+    finally:
+        await listener.stop()

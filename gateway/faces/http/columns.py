@@ -10,7 +10,7 @@ A value that the map does not name (state 17, bit 9) is written while it lasts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 
@@ -19,6 +19,9 @@ from gateway.faces.http.text import escaped, number
 
 Tails = tuple[bytes, ...]
 """The ends of a device's lines, each behind `name{labels`; the first is empty, so that these are what is between."""
+
+_LINES_A_PART = 200
+"""As many as there are of plain numbers with so many devices."""
 
 _TAILS_KEPT = 64
 """Of a point's values that were written last; states are few, bits hardly ever change."""
@@ -45,8 +48,8 @@ class NumberColumn:
         self._pick: Callable[[Mapping[str, Value]], Value] = itemgetter(name)
         self._scale = scale
 
-    def pieces(self, shown: Shown) -> Sequence[bytes]:
-        """The lines of the devices that have a value, in pieces."""
+    def parts(self, shown: Shown) -> Iterator[Sequence[bytes]]:
+        """The lines of the devices that have a value, in pieces; at once."""
         labels: Sequence[bytes] = shown.closed
         try:
             values = list(map(self._pick, shown.values))
@@ -60,7 +63,7 @@ class NumberColumn:
         pieces = [self._begin] * (3 * len(values))
         pieces[1::3] = labels
         pieces[2::3] = map(number, values)
-        return pieces
+        yield pieces
 
 
 class TailsColumn:
@@ -78,16 +81,22 @@ class TailsColumn:
         self._of_texts = of_texts
         self._kept: dict[Value | str, Tails] = {}
 
-    def pieces(self, shown: Shown) -> Sequence[bytes]:
-        """The lines of the devices that have a value, in pieces."""
+    def parts(self, shown: Shown) -> Iterator[Sequence[bytes]]:
+        """The lines of the devices that have a value, in pieces; a few devices at a time: there may be many lines."""
         begin, name, kept = self._begin, self._name, self._kept
         values: Sequence[Mapping[str, Value | str]] = shown.texts if self._of_texts else shown.values
-        pieces = []
+        pieces: list[bytes] = []
+        lines = 0
         for labels, of in zip(shown.labels, values, strict=True):
             if name in of:
                 value = of[name]
-                pieces.append((begin + labels).join(kept[value] if value in kept else self._keep(value)))
-        return pieces
+                tails = kept[value] if value in kept else self._keep(value)
+                pieces.append((begin + labels).join(tails))
+                lines += len(tails)
+                if lines > _LINES_A_PART:
+                    yield pieces
+                    pieces, lines = [], 0
+        yield pieces
 
     def _keep(self, value: Value | str) -> Tails:
         if len(self._kept) >= _TAILS_KEPT:

@@ -169,16 +169,18 @@ class DeviceMetrics:
         )
 
     def families(self, moment: Moment, now: float) -> Iterator[tuple[MetricInfo, Lines]]:
-        """Each family that has samples, with the lines of all devices, by model and unit id; `now` is for the ages."""
+        """Each family that has samples, with the lines of all devices, by model and unit id; `now` is for the ages.
+
+        A large family comes in parts, one after the other.
+        """
         if moment.devices:
             yield from _status(moment.devices, now)
         for name, info in self._families.items():
-            pieces: list[bytes] = []
             for model, shown in moment.shown:
                 if name in model.columns:
-                    pieces += model.columns[name].pieces(shown)
-            if pieces:
-                yield info, pieces
+                    for pieces in model.columns[name].parts(shown):
+                        if pieces:
+                            yield info, pieces
 
 
 def _status(seen: Sequence[tuple[_Device, Snapshot]], now: float) -> Iterator[tuple[MetricInfo, Lines]]:

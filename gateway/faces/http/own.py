@@ -244,8 +244,15 @@ class OwnMetrics:
         self._lines = [Source.labelled(line, LINE_LABELS, (line.name, site.of_line(line.name))) for line in site.lines]
         self._devices = [Source.labelled(device, DEVICE_LABELS, device_labels(site, device)) for device in site.devices]
 
+    def look(self, now: float) -> Iterator[None]:
+        """Bring the conditions up to date; a step of the iteration is one device."""
+        if self._counts.conditions is not None:
+            for device in self._devices:
+                self._counts.conditions.devices[device.of.unit_id].look(now)
+                yield
+
     def families(self, now: float) -> Iterator[tuple[MetricInfo, Lines]]:
-        """Each family that has samples, with its lines."""
+        """Each family that has samples, with its lines; conditions as they were at the last `look`."""
         counts = self._counts
         lines = [Source(LineView(line.of, line.of.status(now)), line.labels, line.written) for line in self._lines]
         yield from families(GATEWAY_RULES, [Source(GatewayView(self._started_at(), not counts.not_ready()))])
@@ -263,17 +270,14 @@ class OwnMetrics:
             yield from families(STORE_RULES, [Source(counts.history)])
             yield from families(DEVICE_HISTORY_RULES, self._histories(counts.history, now))
         if counts.conditions is not None:
-            yield from families(DEVICE_CONDITION_RULES, self._conditions(counts.conditions, now))
+            yield from families(DEVICE_CONDITION_RULES, self._conditions(counts.conditions))
             yield from families(GATEWAY_CONDITION_RULES, gateway_sources(counts.conditions))
         yield from families(NOTIFY_RULES, [receiver_source(stats) for stats in counts.notifications])
 
-    def _conditions(self, conditions: Conditions, now: float) -> list[Source[DeviceConditions]]:
-        found = []
-        for device in self._devices:
-            of = conditions.devices[device.of.unit_id]
-            of.look(now)
-            found.append(Source(of, device.labels, device.written))
-        return found
+    def _conditions(self, conditions: Conditions) -> list[Source[DeviceConditions]]:
+        return [
+            Source(conditions.devices[device.of.unit_id], device.labels, device.written) for device in self._devices
+        ]
 
     def _histories(self, history: HistoryStats, now: float) -> list[Source[DeviceHistoryView]]:
         return [

@@ -14,6 +14,9 @@ from gateway.core.histogram import Histogram
 from gateway.faces.http.metric import Labels, MetricInfo, counter, gauge, histogram
 from gateway.faces.http.text import Lines, label_pairs, number, sample_lines
 
+SOURCES_A_PART = 64
+"""Sources that are read in one go."""
+
 T = TypeVar("T")
 
 Sample = tuple[Labels, float | Histogram]
@@ -82,7 +85,12 @@ def known(metric: MetricInfo, pick: Callable[[T], float | None]) -> Rule[T]:
 
 def each(metric: MetricInfo, pick: Callable[[T], Mapping[str, float]]) -> Rule[T]:
     """One number for each key of a mapping, the key as the last label."""
-    return Rule(metric, lambda source: [((key,), count) for key, count in sorted(pick(source).items())])
+
+    def read(source: T) -> Iterable[Sample]:
+        counts = pick(source)
+        return [((key,), counts[key]) for key in sorted(counts)]
+
+    return Rule(metric, read)
 
 
 def times(metric: MetricInfo, pick: Callable[[T], Histogram]) -> Rule[T]:
@@ -91,11 +99,12 @@ def times(metric: MetricInfo, pick: Callable[[T], Histogram]) -> Rule[T]:
 
 
 def families(rules: Iterable[Rule[T]], sources: Sequence[Source[T]]) -> Iterator[tuple[MetricInfo, Lines]]:
-    """Each metric that has samples, with its lines."""
+    """Each metric that has samples, with its lines; those of many sources in parts, one after the other."""
     for rule in rules:
-        lines = rule.lines(sources)
-        if lines:
-            yield rule.metric, lines
+        for at in range(0, len(sources), SOURCES_A_PART):
+            lines = rule.lines(sources[at : at + SOURCES_A_PART])
+            if lines:
+                yield rule.metric, lines
 
 
 def gateway_gauge(name: str, help_text: str, *labels: str) -> MetricInfo:

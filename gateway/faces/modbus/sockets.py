@@ -8,7 +8,8 @@ Rule 1: a transport calls its protocol as asyncio's do: `connection_made`, any `
         never from within a call of the protocol's own.
 Rule 2: what is written goes to the kernel at once. The rest is kept in order; more than the protocol's limit of
         it pauses the protocol.
-Rule 3: nobody has the loop for long: a turn serves `TURN` events, and takes 2.5 kB from each socket.
+Rule 3: nobody has the loop for long: a turn serves `TURN` events, and takes 2.5 kB from each socket. Others that have
+        it for longer than a request takes let a turn come between (`serve`).
 Rule 4: a peer that is gone is noticed also while nothing is read from it.
 Rule 5: a client's socket is watched for edges: the kernel tells once that something came, and does not look again
         whether more is there, which is a tenth of the work on a small request. So whoever takes less than all
@@ -58,7 +59,7 @@ class Hub:
         if self._epoll is None:
             self._epoll = select.epoll()
             self._loop = asyncio.get_running_loop()
-            self._loop.add_reader(self._epoll.fileno(), self._ready)
+            self._loop.add_reader(self._epoll.fileno(), self.serve)
         self._epoll.register(fd, events)
         self._calls[fd] = call
         if take is not None:
@@ -80,7 +81,11 @@ class Hub:
             self._epoll.close()
             self._epoll = self._loop = None
 
-    def _ready(self) -> None:
+    def serve(self) -> None:
+        """One turn: serve who is ready. The loop calls it, and whoever else has the loop and gives way.
+
+        It costs a microsecond when nobody is ready.
+        """
         if self._epoll is None:
             return
         poll = self._epoll.poll

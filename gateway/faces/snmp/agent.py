@@ -1,7 +1,8 @@
 """The SNMP agent's sockets: UDP, IPv4 and IPv6; SNMPv1, v2c and v3; read-only.
 
 1. A datagram is answered where it arrives, without a queue or a task: `responder.py` never waits. Those that wait in
-   the socket are answered together, for at most TURN_S; then the others of the event loop have their turn.
+   the socket are answered together, for at most TURN_S; then the others of the event loop have their turn. Modbus
+   clients have it every SHARE_S (`give_way`).
 2. The sockets are bound by ourselves, so that a taken port is an error with a name. Before the first of them is bound,
    the boots of this start are on disk (`engine.py`).
 """
@@ -11,7 +12,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import gateway
 from gateway.clock import Clock
@@ -42,8 +43,12 @@ _log = logging.getLogger(__name__)
 TURN_S = 0.001
 """How long waiting datagrams are answered in one go; the one under way then is finished."""
 
+SHARE_S = 0.00005
+"""How long they are answered before `give_way`; the one under way then is finished."""
+
 KNOWN_A_LOOK = 7
-"""After so many requests that were answered before, less one, the clock is looked at again; a mask."""
+"""After so many requests that were answered before, less one, the clock is looked at again; a mask. It is looked at
+after each that had to be read anew as well, for that may be a hundred cells."""
 
 
 class SnmpAgent:
@@ -63,10 +68,12 @@ class SnmpAgent:
         clients: Iterable[Client] = (),
         days: LogDays | None = None,
         before: SnmpAgent | None = None,
+        give_way: Callable[[], None] = lambda: None,
     ) -> None:
         """Without `conditions` of somebody who tells them of the gateway, those of lines and devices are shown.
 
         `clients` are those of the Modbus TCP face at any moment, `days` the log table; without it there is none.
+        `give_way` serves those who must not wait for a turn of this face to end; it is called every SHARE_S of it.
         With `before` it is made to be given to that one's `adjust`: same counters, same engine, same uptime.
         """
         self.counters: SnmpCounters = SnmpCounters() if before is None else before.counters
@@ -74,6 +81,8 @@ class SnmpAgent:
         self.layout: Layout = shipped_layout(settings.enterprise_root)
         self.settings = settings
         self._clock = clock
+        self._give_way = give_way
+        self._share_ends_at = 0.0
         self._engine: Engine | None = None if before is None else before._engine  # noqa: SLF001 - its own kind
         described = Gateway(
             site=site,
@@ -198,10 +207,11 @@ class SnmpAgent:
 
     def answer_waiting(self, sock: socket.socket, context: bytes = b"") -> None:
         """Answer what waits in the socket, for one turn."""
-        monotonic, again, receive, send = self._clock.monotonic, self._responder.again, sock.recvfrom, sock.sendto
-        now = monotonic()
-        until = now + TURN_S
-        known = 0
+        responder, monotonic, receive, send = self._responder, self._clock.monotonic, sock.recvfrom, sock.sendto
+        again = responder.again
+        now = self._begin()
+        until, share = now + TURN_S, now + SHARE_S
+        known, readings = 0, responder.readings
         while True:
             try:
                 data, address = receive(DATAGRAM_LIMIT + 1)
@@ -225,12 +235,26 @@ class SnmpAgent:
                 except OSError:
                     self.counters.send_failures += 1
             # What is known costs microseconds, so the clock is looked at only now and then.
-            if not known & KNOWN_A_LOOK:
+            if not known & KNOWN_A_LOOK or responder.readings != readings:
+                readings = responder.readings
                 now = monotonic()
-                if now >= until:
-                    break
+                if now >= share:
+                    self._give_way()
+                    now = monotonic()
+                    if now >= until:
+                        break
+                    share = now + SHARE_S
+        self._share_ends_at = share
         self.counters.in_packets += known
         self.counters.responses += known
+
+    def _begin(self) -> float:
+        """When a turn begins: others had the loop meanwhile, and took as long as they took."""
+        now = self._clock.monotonic()
+        if now < self._share_ends_at:
+            return now
+        self._give_way()
+        return self._clock.monotonic()
 
     def _warm_up(self) -> None:
         """Encode a cell of every column and answer every kind of request once, so that no first one waits for it."""

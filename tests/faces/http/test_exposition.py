@@ -8,6 +8,7 @@ import sys
 import zlib
 from collections import Counter
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -15,12 +16,13 @@ from hypothesis import strategies as st
 from prometheus_client.exposition import generate_latest
 from prometheus_client.openmetrics.exposition import generate_latest as generate_openmetrics
 
+from gateway.core.conditions import Conditions
 from gateway.core.site import Site
 from gateway.core.snapshot import DeviceState, Snapshot
 from gateway.core.stats import DeviceHistoryStats, HistoryStats, ModbusServerStats
 from gateway.devices.model import Kind
 from gateway.devices.schema import load_map, models
-from gateway.faces.http.exposition import PIECE_BYTES, Exposition, compressed
+from gateway.faces.http.exposition import LOOKS_A_TURN, PIECE_BYTES, TURN_BYTES, Exposition, compressed
 from gateway.faces.http.own import Counts, HttpStats
 from gateway.faces.http.packing import packer
 from gateway.faces.http.text import OPENMETRICS, TEXT, Format
@@ -174,7 +176,10 @@ def large_site(clock: ManualClock, count: int) -> Site:
 
 
 async def test_a_large_scrape_gives_way_to_others(clock: ManualClock) -> None:
-    exposition = Exposition(large_site(clock, 100), clock, Counts())
+    """A turn of the loop writes little: of a family with thousands of lines only a part."""
+    count = 100
+    site = large_site(clock, count)
+    exposition = Exposition(site, clock, Counts(conditions=Conditions(site, (), clock.now)))
     turns = 0
 
     async def others() -> None:
@@ -186,10 +191,36 @@ async def test_a_large_scrape_gives_way_to_others(clock: ManualClock) -> None:
     other = asyncio.create_task(others())
     pieces = [len(piece) async for piece in exposition.pieces(TEXT)]
     other.cancel()
-    largest_family = 50 * 1024 * 10  # 27 alarms of 100 devices, a line of 150 bytes each
-    assert all(PIECE_BYTES <= piece < PIECE_BYTES + largest_family for piece in pieces[:-1])
-    assert len(pieces) > 10
-    assert turns >= len(pieces) - 1
+    part = 48 * 1024  # 227 lines
+    assert all(PIECE_BYTES <= piece < PIECE_BYTES + part for piece in pieces[:-1])
+    assert len(pieces) > 20
+    assert turns >= count // LOOKS_A_TURN + sum(pieces) // (TURN_BYTES + part / 2)
+
+
+async def test_conditions_are_those_of_the_snapshots_that_are_shown(clock: ManualClock) -> None:
+    """They are looked at a few devices at a time."""
+    site = large_site(clock, 3 * LOOKS_A_TURN)
+    conditions = Conditions(site, (), clock.now)
+    exposition = Exposition(site, clock, Counts(conditions=conditions))
+    after_turns = [0]
+
+    async def others() -> None:
+        while True:
+            after_turns.append(len(tuple(conditions.active())))
+            await asyncio.sleep(0)
+
+    other = asyncio.create_task(others())
+    for value in (0, 1, 0):
+        for device in site.devices:
+            device.snapshot = online(clock.now, values={"array_faults": value})
+        found = seen(parse(await joined(exposition.pieces(TEXT))))
+        raised = Counter[str]()
+        for (name, labels), number in found.items():
+            if name == "prostar_gateway_conditions":
+                raised[dict(labels)["unit_id"]] += int(number)
+        assert raised == {str(device.unit_id): value for device in site.devices}
+    other.cancel()
+    assert max(after - before for before, after in pairwise(after_turns)) == LOOKS_A_TURN
 
 
 async def test_a_poll_during_a_scrape_changes_nothing_of_it(clock: ManualClock) -> None:
@@ -212,7 +243,7 @@ async def test_gzip_in_pieces_is_one_stream(clock: ManualClock, library: str, mo
         pytest.importorskip("isal")
     else:
         monkeypatch.setitem(sys.modules, "isal.isal_zlib", None)
-    assert isinstance(packer(), type(zlib.compressobj())) is (library == "zlib")
+    assert isinstance(packer()[0], type(zlib.compressobj())) is (library == "zlib")
     exposition = Exposition(large_site(clock, 30), clock, Counts())
     stream = zlib.decompressobj(wbits=31)
     whole = b"".join([stream.decompress(piece) async for piece in compressed(exposition.pieces(TEXT))])

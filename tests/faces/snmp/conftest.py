@@ -78,9 +78,9 @@ def make_agent(
     clients = ClientTable(ModbusServerStats(), 2.0)
     clients.arrived("192.0.2.7", ClientRate(), NOW)
 
-    def make(**changes: object) -> SnmpAgent:
+    def make(give_way: Callable[[], None] = lambda: None, **changes: object) -> SnmpAgent:
         changed = replace(settings, **changes)  # type: ignore[arg-type]
-        return SnmpAgent(changed, site, clock, modbus_stats, clients=clients, days=days)
+        return SnmpAgent(changed, site, clock, modbus_stats, clients=clients, days=days, give_way=give_way)
 
     return make
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
-from functools import cache
 
 from pyasn1.codec.ber import encoder
 from pysnmp.proto import rfc1902, rfc1905
@@ -32,18 +31,12 @@ END_OF_MIB_VIEW = encoder.encode(rfc1905.EndOfMibView(""))
 Pairs = list[tuple[Oid, bytes]]
 
 
-@cache
-def shows(view: View, oid: Oid) -> bool:
-    """Whether the view has it: asked again and again of the same few thousand."""
-    return view.shows(oid)
-
-
 class Oracle:
     """The cells of `tree` that `view` shows, as they are at `now`."""
 
     def __init__(self, tree: Iterable[Cell], view: View, now: float) -> None:
-        cells = [(cell.oid, cell) for cell in tree]
-        found = [(oid, cell.object.syntax, cell.object.get(cell.row, now)) for oid, cell in cells if shows(view, oid)]
+        shown = [cell for cell in tree if view.shows(cell.oid)]
+        found = [(cell.oid, cell.object.syntax, cell.object.get(cell.row, now)) for cell in shown]
         self._cells = {oid: (syntax, value) for oid, syntax, value in found if value is not None}
         self._oids = sorted(self._cells)
 

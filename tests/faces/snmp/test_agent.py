@@ -5,15 +5,28 @@ from __future__ import annotations
 import asyncio
 import socket
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
 from typing import cast
 
 import pytest
 from pysnmp.proto.api import v2c
 
+from gateway.core.site import Site
 from gateway.errors import ListenError
-from gateway.faces.snmp.agent import KNOWN_A_LOOK, TURN_S, SnmpAgent
+from gateway.faces.snmp.agent import KNOWN_A_LOOK, SHARE_S, TURN_S, SnmpAgent
+from gateway.faces.snmp.layout import shipped_layout
+from gateway.faces.snmp.objects import RowKind
+from gateway.faces.snmp.settings import SnmpSettings
 from tests.faces.snmp.stub_site import StubClock, listening
-from tests.faces.snmp.test_responder import LOCAL, SYS_DESCR, Reply, request
+from tests.faces.snmp.test_responder import LOCAL, SYS_DESCR, SYS_UP_TIME, Reply, request
+
+POINTS = next(
+    table.base
+    for table in shipped_layout(SnmpSettings(listen=()).enterprise_root).tables
+    if table.rows is RowKind.DEVICE and any(column.point for column in table.columns)
+)
+"""Where values of controllers begin."""
 
 
 async def exchange(address: tuple[str, int], data: bytes) -> bytes:
@@ -104,16 +117,21 @@ async def test_an_asker_that_is_gone_does_not_stop_the_server(make_agent: Callab
 
 
 class Flood:
-    """A socket in which there is always one more datagram, each 0.1 ms after the other."""
+    """A socket in which there is always one more datagram; each takes a while to answer."""
 
-    def __init__(self, clock: StubClock, data: bytes) -> None:
+    def __init__(
+        self, clock: StubClock, data: bytes, takes_s: float = 0.0001, meanwhile: Callable[[], None] = lambda: None
+    ) -> None:
         self._clock = clock
         self._data = data
+        self._meanwhile = meanwhile
+        self._takes_s = takes_s
         self.taken = 0
         self.sent = 0
 
     def recvfrom(self, _size: int) -> tuple[bytes, tuple[str, int]]:
-        self._clock.now += 0.0001
+        self._clock.now += self._takes_s
+        self._meanwhile()
         self.taken += 1
         return self._data, (LOCAL, 4711)
 
@@ -133,3 +151,45 @@ def test_a_flood_gets_a_turn_and_no_more(
     at_once = round(TURN_S / 0.0001)
     assert at_once <= flood.taken == flood.sent <= at_once + KNOWN_A_LOOK + 1
     assert agent.counters.in_packets == agent.counters.responses == flood.taken
+
+
+@pytest.mark.parametrize("gives", ["one cell, known", "fifty cells, changed", "clock, never known"])
+def test_in_a_turn_others_are_let_through_again_and_again(
+    make_agent: Callable[..., SnmpAgent], site: Site, clock: StubClock, gives: str
+) -> None:
+    """A Modbus client waits for SHARE_S of datagrams at most, and for the request that is under way then."""
+    takes_s, at_most, data = {
+        "one cell, known": (SHARE_S / 6, KNOWN_A_LOOK + 1, request(v2c.GetRequestPDU, SYS_DESCR)),
+        "fifty cells, changed": (SHARE_S / 0.9, 1, request(v2c.GetBulkRequestPDU, POINTS, bulk=(0, 50))),
+        "clock, never known": (SHARE_S / 0.9, 1, request(v2c.GetRequestPDU, SYS_DESCR, SYS_UP_TIME)),
+    }[gives]
+
+    def poll() -> None:
+        if gives == "fifty cells, changed":
+            site.devices[0].snapshot = replace(site.devices[0].snapshot, version=site.devices[0].snapshot.version + 1)
+
+    let_through: list[int] = []
+    flood = Flood(clock, data, takes_s, poll)
+    agent = make_agent(requests_per_s=1e9, give_way=lambda: let_through.append(flood.sent))
+    for _ in range(2):  # what can be known is known the second time
+        flood.sent = 0
+        clock.now += 1.0
+        let_through.clear()
+        agent.answer_waiting(cast("socket.socket", flood))
+    waits = [after - before for before, after in pairwise([0, *let_through])]
+    assert max(waits) <= at_most
+    assert (let_through[0], let_through[-1]) == (0, flood.sent)
+    assert len(let_through) >= TURN_S / SHARE_S / 4
+
+
+def test_the_time_of_those_who_are_let_through_is_of_the_turn(
+    make_agent: Callable[..., SnmpAgent], clock: StubClock
+) -> None:
+    """However long Modbus clients take, the rest of the event loop has its turn after a millisecond."""
+
+    def take() -> None:
+        clock.now += TURN_S
+
+    flood = Flood(clock, request(v2c.GetRequestPDU, SYS_DESCR), SHARE_S)
+    make_agent(requests_per_s=1e9, give_way=take).answer_waiting(cast("socket.socket", flood))
+    assert flood.sent <= KNOWN_A_LOOK + 1

@@ -20,10 +20,9 @@ from gateway.faces.snmp.agent import SnmpAgent
 from gateway.faces.snmp.columns import Column
 from gateway.faces.snmp.settings import EVERYTHING, Oid
 from gateway.faces.snmp.singles import Single
-from tests.faces.snmp import ber
 from tests.faces.snmp.oracle import END_OF_MIB_VIEW, MISSING, Oracle
 from tests.faces.snmp.stub_site import StubClock, StubLine, online
-from tests.faces.snmp.test_differential import V2C, V3, Pair, Step, forget, meaning
+from tests.faces.snmp.test_differential import V2C, V3, Pair, Step, forget, meaning, read_pdu
 from tests.faces.snmp.test_responder import LIVE
 
 UNITS = (11, 12, 21, 126, 127, 128, 129, 247)  # from 128 on an index takes two octets
@@ -109,7 +108,7 @@ def assert_as_it_is(pair: Pair, step: Step) -> None:
     assert counters[0]["internal_errors"] == 0
     quick, slow = (meaning(reply or b"", step, poller) for reply in replies)
     assert quick == slow
-    status, _, found = quick if isinstance(quick, tuple) else ber.response(quick.pdu)
+    status, _, found = quick if isinstance(quick, tuple) else read_pdu(quick.pdu)
     assert status == 0
     expected = NearOracle(pair).ask(step.kind, step.names, (0, 0))
     if expected[0][1] == MISSING:
