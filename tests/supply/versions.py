@@ -1,4 +1,4 @@
-"""Print which libraries of this environment are newer than a lock file says: `python -m tests.supply.versions LOCK`."""
+"""Print which libraries here are others than a lock file says: `python -m tests.supply.versions LOCK`."""
 
 from __future__ import annotations
 
@@ -8,11 +8,16 @@ from pathlib import Path
 
 from tests.supply.locked import locked
 
+MADE_WITH = {"pip", "setuptools", "wheel"}
+"""What an environment has from the start, in versions of its own."""
+
 
 def main() -> None:
     """One line for each that differs."""
     differing = []
     for name, pinned in locked(Path(sys.argv[1])).items():
+        if name in MADE_WITH:
+            continue
         try:
             here = version(name)
         except PackageNotFoundError:
