@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ssl
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -36,6 +37,8 @@ def launch(tmp_path: Path, start: Start, free_tcp_port: Callable[[], int], free_
         rest: str = "",
         modbus_keys: str = "",
         *,
+        http_keys: str = "",
+        trusted: ssl.SSLContext | None = None,
         models: Mapping[str, str] = MODELS,
     ) -> Running:
         simulator = None
@@ -43,8 +46,17 @@ def launch(tmp_path: Path, start: Start, free_tcp_port: Callable[[], int], free_
             simulator = start(*GATEWAY, "simulate", "--link-dir", str(tmp_path), *simulate)
             wait_until(lambda: any(path.is_symlink() for path in tmp_path.iterdir()), "the simulated lines")
         ports = (free_tcp_port(), free_udp_port(), free_tcp_port())
-        write_config(tmp_path / "site.toml", ports, devices, line_keys, rest, modbus_keys=modbus_keys, models=models)
+        write_config(
+            tmp_path / "site.toml",
+            ports,
+            devices,
+            line_keys,
+            rest,
+            modbus_keys=modbus_keys,
+            http_keys=http_keys,
+            models=models,
+        )
         gateway = start(*GATEWAY, "run", "-c", str(tmp_path / "site.toml"))
-        return Running(tmp_path, *ports, gateway, simulator)
+        return Running(tmp_path, *ports, gateway, simulator, trusted)
 
     return launcher

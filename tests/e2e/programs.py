@@ -7,6 +7,7 @@ import os
 import queue
 import re
 import signal
+import ssl
 import subprocess
 import sys
 import threading
@@ -115,11 +116,13 @@ class Running:
     http: int
     gateway: Program
     simulator: Program | None
+    trusted: ssl.SSLContext | None = None  # HTTP is asked by TLS, and whom it trusts
 
     def get(self, path: str) -> tuple[int, str]:
         """Status and text of an HTTP reply; 0 when there is none."""
         try:
-            with urllib.request.urlopen(f"http://127.0.0.1:{self.http}{path}", timeout=30) as reply:
+            url = f"http{'s' if self.trusted else ''}://127.0.0.1:{self.http}{path}"
+            with urllib.request.urlopen(url, timeout=30, context=self.trusted) as reply:
                 return reply.status, reply.read().decode()
         except urllib.error.HTTPError as error:
             with error:
@@ -154,6 +157,7 @@ def write_config(
     rest: str = "",
     *,
     modbus_keys: str = "",
+    http_keys: str = "",
     models: Mapping[str, str] = MODELS,
 ) -> None:
     """A configuration whose lines are links in the folder of the file; `models` by name, ProStars else."""
@@ -165,7 +169,8 @@ def write_config(
             if at == line:
                 text += f'[[line.device]]\nname = "{name}"\naddress = {address}\nunit_id = {unit}\n'
                 text += f'model = "{models.get(name, "prostar-mppt")}"\n'
-    text += f'[modbus]\nlisten = ["127.0.0.1:{modbus}"]\n{modbus_keys}\n[http]\nlisten = ["127.0.0.1:{http}"]\n'
+    text += f'[modbus]\nlisten = ["127.0.0.1:{modbus}"]\n{modbus_keys}\n'
+    text += f'[http]\nlisten = ["127.0.0.1:{http}"]\n{http_keys}\n'
     text += f'[snmp]\nlisten = ["127.0.0.1:{snmp}"]\n'
     text += '[[snmp.community]]\nname = "public"\nsource = ["127.0.0.0/8"]\n'
     path.write_text(text + rest)
