@@ -18,6 +18,7 @@ from gateway.modbus.transactions import Failed, Replied
 
 TIMING = Timing.of(9600, 8, "N", 2)
 TIMEOUT_S = 0.5
+TRANSACTIONS = 8  # of one script; the rest of a long one is left
 REQUESTS = (
     ReadRequest(3, 0x0018, 2).encode(),
     ReadRequest(4, 0x0000, 80).encode(),
@@ -57,7 +58,9 @@ def feed(data: bytes) -> int:
     client = RtuClient(TIMING, counters, quarantine_s=0.05)
     now, delivered = 0.0, 0
     client.reset(now)
-    while script:
+    for _ in range(TRANSACTIONS):
+        if not script:
+            break
         address, request = 1 + script.number() % 3, REQUESTS[script.number() % len(REQUESTS)]
         now = client.ready_at(now)
         sent = client.send(address, request, now, TIMEOUT_S)

@@ -8,7 +8,8 @@ from ipaddress import ip_network
 
 import pytest
 
-from gateway.core.ratelimit import ClientRate, LineRates
+from gateway.core.ratelimit import PAUSE_LEAST_S, ClientRate, LineRates
+from gateway.faces.modbus.connection import TURN
 from gateway.faces.modbus.settings import RateSettings
 from gateway.modbus import mbap
 from tests.faces.modbus.conftest import READ_1, Running, Serve, World, read, registers
@@ -53,6 +54,34 @@ async def test_another_client_keeps_all_its_requests(limited: Running) -> None:
     for tid in range(90):
         assert await other.query(12, READ_1, tid) == b"\x03\x02" + registers(2, 0, 1)
     assert world.stats.limited["client"] < 10, "a flood is paused, not refused one by one"
+
+
+async def test_ten_thousand_requests_a_second_keep_nobody_waiting_longer_than_a_turn(
+    serve: Serve, world: World
+) -> None:
+    """As the gateway is by default. Counted in requests that are looked at, which a busy machine does not change."""
+    rates = RateSettings(networks=())
+    running = await serve(rate=rates)
+    flood = await running.connect(local_addr=("127.0.0.9", 0))
+    other = await running.connect(local_addr=("127.0.0.2", 0))
+    clients = {client.name: client for client in running.server.clients}
+    flooding = clients["127.0.0.9"]
+    ahead = []
+    for tick in range(300):  # three seconds
+        if tick % 100 == 0:
+            world.poll(12)
+        flood.send(ready(world, 100))
+        before = flooding.requests
+        assert await other.query(12, READ_1, tick) == b"\x03\x02" + registers(2, 0, 1)
+        ahead.append(flooding.requests - before)
+        world.clock.now += 0.01
+    assert max(ahead) <= TURN, "one turn of the loop"
+    bucket = rates.client.requests_per_s * rates.burst_s
+    assert bucket <= flooding.requests <= bucket + 3 * rates.client.requests_per_s + flooding.limited
+    assert 1 <= flooding.limited <= 3 / PAUSE_LEAST_S, "it is paused, not refused one by one"
+    assert ahead[-50:] == [0] * 50, "nothing is read from it at the end"
+    assert clients["127.0.0.2"].limited == 0
+    flood.reset()
 
 
 async def test_more_connections_give_no_more_tokens(limited: Running) -> None:

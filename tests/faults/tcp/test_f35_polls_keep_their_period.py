@@ -10,7 +10,7 @@ from gateway.core.ratelimit import Bucket, ClientRate, LineLimiter, LineRates
 from gateway.modbus.pdu import Function, ReadRequest
 from tests.core.test_engine import Registers
 from tests.core.virtual_line import VirtualLine, make_line
-from tests.faults.tcp.test_every_request_ends_in_time import VirtualPort
+from tests.faults.tcp.virtual import VirtualPort
 
 LIVE_BLOCK = 82
 BURST_S = 2.0

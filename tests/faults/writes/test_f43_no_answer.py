@@ -6,9 +6,15 @@ from pathlib import Path
 
 import pytest
 
+from gateway.core.site import Outcome
 from gateway.core.write_ledger import Fate
+from gateway.errors import LineDown, ReplyMismatch, ReplyTimeout
 from gateway.faces.modbus import writer
+from tests.core.test_engine import Registers
+from tests.core.virtual_line import make_line
 from tests.faces.modbus.writing import writing
+
+WRITE = bytes.fromhex("06 e000 4b64")
 
 
 @pytest.mark.parametrize(("swallowed", "settled"), [(0, Fate.WRITTEN), (1, Fate.NOT_WRITTEN)])
@@ -58,3 +64,63 @@ async def test_one_that_a_restart_interrupted_is_settled_by_the_next_run(tmp_pat
     async with writing(tmp_path, line=line) as it:
         assert await it.query("05 0002 ff00") == "050002ff00"
         await it.until(lambda: it.fates() == [Fate.NOT_WRITTEN, Fate.WRITTEN])
+
+
+class Deaf(Registers):
+    """A controller that answers reads, and a write in its own way."""
+
+    def __init__(self, answer: bytes | None) -> None:
+        super().__init__(1)
+        self.answer = answer
+        self.writes = 0
+
+    def handle(self, pdu: bytes, now: float) -> bytes | None:
+        if pdu[0] != WRITE[0]:
+            return super().handle(pdu, now)
+        self.writes += 1
+        return self.answer
+
+
+@pytest.mark.parametrize(
+    ("answer", "outcome"),
+    [
+        pytest.param(None, ReplyTimeout, id="no answer"),
+        pytest.param(bytes.fromhex("06 e000 4b65"), ReplyMismatch, id="the answer to another write"),
+        pytest.param(bytes.fromhex("86 06"), bytes, id="busy"),
+        pytest.param(bytes.fromhex("86 04"), bytes, id="failed"),
+    ],
+)
+@pytest.mark.parametrize("gone", [False, True], ids=["it goes on", "it is gone for a while"])
+def test_the_line_sends_it_once_whatever_becomes_of_it(
+    answer: bytes | None, outcome: type[Outcome], gone: bool
+) -> None:
+    unit = Deaf(answer)
+    line = make_line(unit, writes=True, retries=5)
+    line.run(5.0)
+    outcomes: list[Outcome] = []
+    line.write(line.devices[0], WRITE, outcomes.append)
+    line.run(1.0)
+    unit.silent = gone
+    line.run(120.0)
+    unit.silent = False
+    line.run(120.0)
+    assert [type(each) for each in outcomes] == [outcome]
+    assert unit.writes == 1
+    assert sum(frame[1:-2] == WRITE for _, frame in line.sent) == 1
+
+
+def test_the_line_does_not_send_it_again_when_it_is_open_again() -> None:
+    unit = Deaf(None)
+    line = make_line(unit, writes=True, retries=5)
+    line.run(5.0)
+    outcomes: list[Outcome] = []
+    line.write(line.devices[0], WRITE, outcomes.append)
+    while not unit.writes:
+        line.run(0.001)
+    line.engine.closed("unplugged", line.now)
+    line.run(10.0)
+    line.wire.clear()
+    line.engine.opened(line.now)
+    line.run(60.0)
+    assert [type(each) for each in outcomes] == [LineDown]
+    assert unit.writes == 1
