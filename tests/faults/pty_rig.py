@@ -56,7 +56,7 @@ class PtyRig:
         """Pull the adapter when the simulator is done with the bytes at hand."""
         asyncio.get_running_loop().call_soon(self.pty.unplug)
 
-    async def online(self, limit_s: float = 60.0) -> None:
+    async def online(self, limit_s: float = 150.0) -> None:
         """Wait until every device is online and all its blocks are read, so that the line is quiet."""
         blocks = len(poll_plan(oracle_map()))
         await self.until(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import re
 import signal
 import socket
 import sqlite3
 import struct
 import sys
-import time
 from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
@@ -33,6 +33,12 @@ def good_reply(port: int) -> bool:
     return False
 
 
+def worked_s(pid: int) -> float:
+    """Processor time of a process: how long a start takes, however busy the machine is."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 @pytest.mark.parametrize("count", [4, pytest.param(200, marks=[pytest.mark.long, pytest.mark.timeout(1800)])])
 def test_every_start_serves(
     tmp_path: Path,
@@ -49,11 +55,10 @@ def test_every_start_serves(
     write_config(tmp_path / "site.toml", ports, line_keys=f"baudrate = {BAUDRATE}", rest=USER.format(tmp_path))
     took_s, statuses, boots = [], [], []
     for number in range(count):
-        began = time.monotonic()
         gateway = Program((*GATEWAY, "run", "-c", str(tmp_path / "site.toml")))
         try:
             wait_until(lambda: good_reply(ports[0]), "a good reply", SERVES_S)
-            took_s.append(time.monotonic() - began)
+            took_s.append(worked_s(gateway.process.pid))
         finally:
             how = signal.SIGKILL if number % 3 else signal.SIGTERM
             statuses.append((how, gateway.end(how)))
@@ -65,7 +70,7 @@ def test_every_start_serves(
     assert boots == [(boots[0][0], number + 1) for number in range(count)]
     tenth = max(2, count // 10)
     first, last = sorted(took_s[:tenth]), sorted(took_s[-tenth:])
-    assert last[len(last) // 2] < 2 * first[len(first) // 2] + 1.0, "starts become slower"
+    assert last[len(last) // 2] < 2 * first[len(first) // 2] + 0.5, "starts become slower"
     with closing(open_for_reading(tmp_path / "state")) as connection:
         assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
         assert twice(connection) == []
