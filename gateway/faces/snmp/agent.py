@@ -44,11 +44,7 @@ TURN_S = 0.001
 """How long waiting datagrams are answered in one go; the one under way then is finished."""
 
 SHARE_S = 0.00005
-"""How long they are answered before `give_way`; the one under way then is finished."""
-
-KNOWN_A_LOOK = 7
-"""After so many requests that were answered before, less one, the clock is looked at again; a mask. It is looked at
-after each that had to be read anew as well, for that may be a hundred cells."""
+"""How long they are answered before `give_way`; the run or the one under way then is finished."""
 
 
 class SnmpAgent:
@@ -207,46 +203,48 @@ class SnmpAgent:
 
     def answer_waiting(self, sock: socket.socket, context: bytes = b"") -> None:
         """Answer what waits in the socket, for one turn."""
-        responder, monotonic, receive, send = self._responder, self._clock.monotonic, sock.recvfrom, sock.sendto
-        again = responder.again
+        quick, monotonic, receive, send = (
+            self._responder.quick.answer,
+            self._clock.monotonic,
+            sock.recvfrom,
+            sock.sendto,
+        )
         now = self._begin()
         until, share = now + TURN_S, now + SHARE_S
-        known, readings = 0, responder.readings
         while True:
             try:
-                data, address = receive(DATAGRAM_LIMIT + 1)
+                unknown = receive(DATAGRAM_LIMIT + 1) if context else quick(receive, send)
             except (BlockingIOError, InterruptedError):
                 break
             except OSError as error:
                 # An asker that is gone by now (ICMP port unreachable); nothing of ours is wrong.
                 _log.debug("event=snmp_receive_failed reason=%s", error)
                 continue
-            reply = None if context else again(data, address[0], now)
-            if reply is not None:
-                known += 1
-            else:
-                self.counters.in_packets += known
-                self.counters.responses += known
-                known = 0
-                reply = self.answer(data, address[0], context)
-            if reply is not None:
-                try:
-                    send(reply, address)
-                except OSError:
-                    self.counters.send_failures += 1
-            # What is known costs microseconds, so the clock is looked at only now and then.
-            if not known & KNOWN_A_LOOK or responder.readings != readings:
-                readings = responder.readings
+            if unknown is not None:
+                data, address = unknown
+                reply = self._reply(data, address[0], context, now)
+                if reply is not None:
+                    try:
+                        send(reply, address)
+                    except OSError:
+                        self.counters.send_failures += 1
+            now = monotonic()
+            if now >= share:
+                self._give_way()
                 now = monotonic()
-                if now >= share:
-                    self._give_way()
-                    now = monotonic()
-                    if now >= until:
-                        break
-                    share = now + SHARE_S
+                if now >= until:
+                    break
+                share = now + SHARE_S
         self._share_ends_at = share
-        self.counters.in_packets += known
-        self.counters.responses += known
+
+    def _reply(self, data: bytes, host: str, context: bytes, now: float) -> bytes | None:
+        """As `answer`, from what is kept where there is something."""
+        reply = None if context else self._responder.again(data, host, now)
+        if reply is None:
+            return self.answer(data, host, context)
+        self.counters.in_packets += 1
+        self.counters.responses += 1
+        return reply
 
     def _begin(self) -> float:
         """When a turn begins: others had the loop meanwhile, and took as long as they took."""

@@ -178,6 +178,21 @@ def id_place(data: bytes, at: int) -> tuple[int, int]:
     return at, data[at - 1]
 
 
+def message_id_at(data: bytes) -> int:
+    """Where the octets of the request id begin in a message with a community as pollers send it; 0 when it is none."""
+    try:
+        if data[1] < 0x80:
+            at = data[6] + 11
+        elif data[5] == VERSION_3:
+            return 0
+        else:
+            first = data[1] - 0x7E
+            at, _ = id_place(data, first + 5 + data[first + 4])
+    except IndexError:
+        return 0
+    return at if at < len(data) else 0
+
+
 def _inside(data: bytes, at: int, end: int) -> int:
     """Where the content of the value at `at` begins; Unusual when it does not end at `end`."""
     size = data[at + 1]

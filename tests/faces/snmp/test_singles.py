@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import socket
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from typing import cast
 
 import pytest
 from hypothesis import HealthCheck, example, given, settings
@@ -23,7 +25,7 @@ from gateway.faces.snmp.singles import Single
 from tests.faces.snmp.oracle import END_OF_MIB_VIEW, MISSING, Oracle
 from tests.faces.snmp.stub_site import StubClock, StubLine, online
 from tests.faces.snmp.test_differential import V2C, V3, Pair, Step, forget, meaning, read_pdu
-from tests.faces.snmp.test_responder import LIVE
+from tests.faces.snmp.test_responder import LIVE, SYS_DESCR, request
 
 UNITS = (11, 12, 21, 126, 127, 128, 129, 247)  # from 128 on an index takes two octets
 TRISTAR = 12
@@ -159,14 +161,14 @@ def test_numbers_of_points_are_looked_up_and_nothing_else(
     first = ask()
     for each in ("plain_request", "odd_request"):
         monkeypatch.setattr(reader, each, None)
-    long_way = Single._any
+    long_way = Single.reply
     taken: list[bytes] = []
 
-    def noted(single: Single, data: bytes, at: int, now: float) -> bytes | None:
+    def noted(single: Single, data: bytes, now: float) -> bytes | None:
         taken.append(data)
-        return long_way(single, data, at, now)
+        return long_way(single, data, now)
 
-    monkeypatch.setattr(Single, "_any", noted)
+    monkeypatch.setattr(Single, "reply", noted)
     assert ask() == first
     # Only where the next row has an index of another length; version 2c asks twice over the wire, 3 once.
     last_short = sum(column.rows.indexes[-1] > (127,) for column in columns)
@@ -207,3 +209,44 @@ def test_nothing_is_kept_of_a_cell(pair: Pair) -> None:
     kept, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert kept < len(columns) * 4 * 600  # a column, a kind and a length of an index each
+
+
+class Crowd:
+    """A socket in which datagrams of several hosts wait; what goes back to the last host cannot be sent."""
+
+    def __init__(self, waiting: list[tuple[bytes, str]], unreachable: str) -> None:
+        self._waiting = waiting[::-1]
+        self._unreachable = unreachable
+        self.sent: list[str] = []
+
+    def recvfrom(self, _size: int) -> tuple[bytes, tuple[str, int]]:
+        if not self._waiting:
+            raise BlockingIOError
+        data, host = self._waiting.pop()
+        return data, (host, 4711)
+
+    def sendto(self, _data: bytes, address: tuple[str, int]) -> None:
+        if address[0] == self._unreachable:
+            raise OSError
+        self.sent.append(address[0])
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_everybody_has_an_allowance_however_quickly_they_are_answered(
+    make_agent: Callable[..., SnmpAgent], clock: StubClock, *, known: bool
+) -> None:
+    agent = make_agent(requests_per_s=2.0)  # 20 at once
+    number, text = request(GET, (*LIVE, 9, 11)), request(GET, SYS_DESCR)
+    hosts = ["127.0.0.1", "127.0.0.2", "192.0.2.1", "127.0.0.3"]
+    for round_ in range(2):
+        clock.now += 1000.0  # everybody may ask again
+        waiting = [(data, host) for at in range(15) for host in hosts for data in (number, number if known else text)]
+        crowd = Crowd(waiting, hosts[-1])
+        while crowd._waiting:
+            agent.answer_waiting(cast("socket.socket", crowd))
+        assert [crowd.sent.count(host) for host in hosts] == [20, 20, 0, 0]
+        counters = agent.counters
+        assert counters.responses == 60 * (round_ + 1)
+        assert counters.send_failures == 20 * (round_ + 1)
+        assert counters.rate_limited == counters.refused_sources == 30 * (round_ + 1)
+        assert counters.in_packets == counters.responses + counters.dropped == 120 * (round_ + 1)
