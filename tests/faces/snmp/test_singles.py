@@ -237,7 +237,7 @@ def test_everybody_has_an_allowance_however_quickly_they_are_answered(
 ) -> None:
     agent = make_agent(requests_per_s=2.0)  # 20 at once
     number, text = request(GET, (*LIVE, 9, 11)), request(GET, SYS_DESCR)
-    hosts = ["127.0.0.1", "127.0.0.2", "192.0.2.1", "127.0.0.3"]
+    hosts = ["127.0.0.1", "127.0.0.2", "198.51.100.1", "127.0.0.3"]
     for round_ in range(2):
         clock.now += 1000.0  # everybody may ask again
         waiting = [(data, host) for at in range(15) for host in hosts for data in (number, number if known else text)]
