@@ -8,10 +8,13 @@ from __future__ import annotations
 import os
 import shutil
 import socket
-from collections.abc import Callable
+import subprocess
+from collections.abc import Callable, Iterator
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+from tests.cable import Cable
 
 # Deadlines measure the machine, not the code. CI replays the same examples on every run, so that a red
 # build means a changed product; a developer's run explores new ones.
@@ -38,6 +41,19 @@ def peer() -> Callable[[str], str]:
         pytest.skip(reason)
 
     return find
+
+
+@pytest.fixture
+def cable(peer: Callable[[str], str]) -> Iterator[Cable]:
+    """A cable to another machine; skipped where network namespaces are not permitted."""
+    made = Cable(peer("ip"))
+    try:
+        made.plug_in()
+    except subprocess.CalledProcessError as error:
+        made.remove()
+        pytest.skip(f"network namespaces are not permitted here: {error.stderr.strip()}")
+    yield made
+    made.remove()
 
 
 def _free_port(kind: socket.SocketKind) -> int:

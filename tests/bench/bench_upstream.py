@@ -29,6 +29,8 @@ from tests.bench.bench_line import ENVIRONMENT, cpu_s, free_port, modbus_proxy, 
 CLIENTS = 16
 UNITS = (1, 2, 3, 4)
 GATEWAY_UNITS = (11, 12, 13, 14)
+TUNED = {"keeps": "pipelining = 32\n", "closes": "connections = 8\n"}
+"""What a user would set for a converter or gateway that serves many; both are the most that is allowed."""
 LOADS = ("keeps:0", "keeps:5", "closes:0", "closes:5")
 HEAD = ("server", "replies/s", "× modbus-proxy", "p50 ms", "p99 ms", "CPU µs a reply", "refused", "timed out", "wrong")
 
@@ -65,9 +67,9 @@ class Run:
     cpu_us: float = 0.0  # of the server in between, a reply
 
 
-def config(folder: Path, upstream: int, port: int) -> Path:
+def config(folder: Path, upstream: int, port: int, habit: str = "keeps") -> Path:
     text = f'site = "bench"\nstate_dir = "{folder}"\n[[line]]\nname = "far"\nport = "tcp://127.0.0.1:{upstream}"\n'
-    text += "reply_timeout_s = 3.0\n"
+    text += "reply_timeout_s = 3.0\n" + TUNED[habit]
     for unit, address in zip(GATEWAY_UNITS, UNITS, strict=True):
         text += (
             f'[[line.device]]\nname = "array-{unit}"\naddress = {address}\nunit_id = {unit}\nmodel = "prostar-mppt"\n'
@@ -113,7 +115,7 @@ def upstream(how: Load) -> Iterator[int]:
 def gateway(how: Load, seconds: float) -> Run:
     with tempfile.TemporaryDirectory(prefix="bench-") as name, upstream(how) as behind:
         port = free_port()
-        command = [sys.executable, "-m", "gateway", "run", "-c", str(config(Path(name), behind, port))]
+        command = [sys.executable, "-m", "gateway", "run", "-c", str(config(Path(name), behind, port, how.habit))]
         with running(command, port, ENVIRONMENT) as pid:
             load(port, 1.0, GATEWAY_UNITS)  # what the server stands is learnt, and everything is identified
             return loaded(pid, port, seconds, GATEWAY_UNITS)

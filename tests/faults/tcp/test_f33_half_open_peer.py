@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import socket
-import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from ipaddress import ip_network
 
 import pytest
 
 from gateway.faces.modbus import tcp
+from tests.cable import Cable
 from tests.faces.modbus.conftest import GOOD, READ_80, Running, Serve, World
 
-NETWORK = ip_network("198.18.0.0/15")  # for measurements between devices (RFC 2544)
 CLIENT = """
 import socket, sys
 client = socket.create_connection((sys.argv[1], int(sys.argv[2])), 10)
@@ -41,49 +38,6 @@ async def test_the_kernel_is_told_to_find_out_within_a_minute(running: Running) 
     )
     assert (idle, interval, probes) == (30, 10, 3)
     assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 20_000
-
-
-class Cable:
-    """A network namespace at the other end of a pair of interfaces of ours."""
-
-    def __init__(self, ip: str) -> None:
-        self._ip = ip
-        self.name = f"pgw{os.getpid()}"
-        self.near, self.far = f"{self.name}a", f"{self.name}b"
-        first = NETWORK[4 * (os.getpid() % (NETWORK.num_addresses // 4))]  # tests run side by side, each in its /30
-        self.here, self.there = str(first + 1), str(first + 2)
-
-    def run(self, *arguments: str) -> None:
-        subprocess.run([self._ip, *arguments], check=True, capture_output=True, text=True)
-
-    def plug_in(self) -> None:
-        self.run("netns", "add", self.name)
-        self.run("link", "add", self.near, "type", "veth", "peer", "name", self.far, "netns", self.name)
-        self.run("addr", "add", f"{self.here}/30", "dev", self.near)
-        self.run("link", "set", self.near, "up")
-        self.run("-n", self.name, "addr", "add", f"{self.there}/30", "dev", self.far)
-        self.run("-n", self.name, "link", "set", self.far, "up")
-
-    def cut(self) -> None:
-        """Nothing goes through any more, and neither end is told."""
-        self.run("-n", self.name, "link", "set", self.far, "down")
-
-    def remove(self) -> None:
-        for command in (("link", "del", self.near), ("netns", "del", self.name)):
-            subprocess.run([self._ip, *command], check=False, capture_output=True)
-
-
-@pytest.fixture
-def cable(peer: Callable[[str], str]) -> Iterator[Cable]:
-    """A cable to another machine; skipped where network namespaces are not permitted."""
-    made = Cable(peer("ip"))
-    try:
-        made.plug_in()
-    except subprocess.CalledProcessError as error:
-        made.remove()
-        pytest.skip(f"network namespaces are not permitted here: {error.stderr.strip()}")
-    yield made
-    made.remove()
 
 
 @pytest.fixture(
