@@ -1,4 +1,4 @@
-"""`prostar-gateway record`, `trace` and `replay`: what goes over a serial line, and a line that does the same again.
+"""`prostar-gateway record`, `trace` and `replay`: what goes over a line, and a line that does the same again.
 
 The running gateway gives the frames, at a socket in its `state_dir` (service/tracing.py), for as long as we listen.
 """
@@ -12,7 +12,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -25,10 +25,12 @@ from gateway.modbus.recording import Piece, Recording
 from gateway.service.tracing import FILE_NAME
 from gateway.simulator.pty import PtyLine
 from gateway.simulator.replay import ReplayedLine
+from gateway.simulator.replay_tcp import ReplayedServer
+from gateway.simulator.tcp import TcpServer
 
 CONNECT_S = 5.0
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-Line = Annotated[str, typer.Argument(metavar="LINE", help="The name of a serial line.")]
+Line = Annotated[str, typer.Argument(metavar="LINE", help="The name of a line.")]
 
 
 class _Failed(Exception):
@@ -68,14 +70,19 @@ def trace_command(
     line: Line,
     seconds: Annotated[float, typer.Option(min=0.1, max=86400, help="How long.")] = 86400.0,
 ) -> None:
-    """Print what goes over a line of the running gateway, until Ctrl-C: seconds, > sent or < received, bytes."""
+    """Print what goes over a line of the running gateway, until Ctrl-C: seconds, > sent or < received, bytes.
+
+    Of an upstream's further connections the number is shown behind the arrow; no bytes: it was closed.
+    """
     try:
         watched = _watch(config, line, seconds)
         about = json.loads(next(watched))
-        print(f"{about['line']} at {about['port']}, {about['baudrate']} baud, since {about['began']}", flush=True)
+        how = "Modbus TCP" if _is_tcp(about) else f"{about['baudrate']} baud"
+        print(f"{about['line']} at {about['port']}, {how}, since {about['began']}", flush=True)
         for text in watched:
             piece = Piece.parse(text)
-            print(f"{piece.at_s:11.6f} {'>' if piece.sent else '<'} {piece.data.hex(' ')}", flush=True)
+            way = f"{'>' if piece.sent else '<'}{piece.connection or ''}"
+            print(f"{piece.at_s:11.6f} {way} {piece.data.hex(' ') or 'closed'}", flush=True)
     except _Failed as error:
         _exit(str(error))
 
@@ -83,8 +90,11 @@ def trace_command(
 def replay_command(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording that `record` made.")],
     link: Annotated[Path | None, typer.Option(metavar="PATH", help="Make a symlink to the pty there.")] = None,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="For an upstream: the TCP port on 127.0.0.1; 0 takes a free one.")
+    ] = 0,
 ) -> None:
-    """Be the far end of a recorded line, on a pty, until a signal stops it."""
+    """Be the far end of a recorded line, on a pty or as a Modbus TCP server, until a signal stops it."""
     try:
         with file.open(encoding="ascii") as lines:
             recording = Recording.parse(lines)
@@ -92,6 +102,11 @@ def replay_command(
         _exit(f"{file} cannot be read: {error.strerror or error}")
     except ValueError as error:
         _exit(f"{file}: {error}")
+    if _is_tcp(recording.about):
+        _replay_tcp(recording, link, port)
+        return
+    if port:
+        _exit("--port is for the recording of an upstream")
     replayed = ReplayedLine(recording)
     try:
         asyncio.run(_replay(PtyLine(replayed, link=link), recording, replayed.requests))
@@ -100,12 +115,28 @@ def replay_command(
     print(f"answered={replayed.answered} unknown={replayed.unknown}", file=sys.stderr)
 
 
-async def _replay(port: PtyLine, recording: Recording, requests: int) -> None:
+def _replay_tcp(recording: Recording, link: Path | None, port: int) -> None:
+    if link is not None:
+        _exit("--link is for the recording of a serial line")
+    replayed = ReplayedServer(recording)
+    try:
+        asyncio.run(_replay(TcpServer(replayed, port=port), recording, replayed.requests))
+    except OSError as error:
+        _exit(f"cannot listen: {error.strerror or error}")
+    print(f"answered={replayed.answered} unknown={replayed.unknown}", file=sys.stderr)
+
+
+def _is_tcp(about: Mapping[str, Any]) -> bool:
+    return about.get("protocol") == "modbus-tcp"
+
+
+async def _replay(port: PtyLine | TcpServer[ReplayedServer], recording: Recording, requests: int) -> None:
     stopped = asyncio.Event()
     for number in _SIGNALS:
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     async with port:
-        print(f"{recording.about.get('line', '?')} with {requests} different requests at {port.path}", flush=True)
+        where = port.path if isinstance(port, PtyLine) else port.url
+        print(f"{recording.about.get('line', '?')} with {requests} different requests at {where}", flush=True)
         await stopped.wait()
 
 

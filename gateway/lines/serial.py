@@ -27,7 +27,6 @@ from gateway.core.site import Device
 from gateway.errors import PortError
 from gateway.lines.ports import close_port, open_port
 from gateway.lines.shell import STABLE_S, LineShell
-from gateway.lines.tap import Tap
 from gateway.lines.threads import in_thread
 from gateway.lines.transports import Transport, transport_for
 
@@ -48,7 +47,6 @@ class SerialLine(LineShell):
     ) -> None:
         self._rng = rng if rng is not None else Random()  # noqa: S311  # jitter, not secrets
         super().__init__(LineEngine(settings, devices, clock.monotonic(), self._rng), devices, clock)
-        self.tap = Tap()
         self._char_s = settings.timing().char_s
         self._loop: asyncio.AbstractEventLoop | None = None
         self._timer: asyncio.Handle | None = None

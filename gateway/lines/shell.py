@@ -17,6 +17,7 @@ from gateway.core.requests import Lane
 from gateway.core.settings import LineSettings
 from gateway.core.site import Device, LineStatus, Outcome, Ticket
 from gateway.core.stats import LineStats
+from gateway.lines.tap import Tap
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +34,7 @@ class LineShell(ABC):
         self.settings: LineSettings = engine.settings
         self._clock = clock
         self._engine = engine
+        self.tap = Tap()
         self._wake: asyncio.Handle | None = None
         self._idle: asyncio.Future[None] | None = None  # somebody waits until nothing is under way
         self._down_at: float | None = None

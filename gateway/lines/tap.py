@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-Watcher = Callable[[float, bool, bytes], None]
-"""Is told when (monotonic), whether it was sent, and the bytes; must not block and must not raise."""
+Watcher = Callable[[float, bool, bytes, int], None]
+"""Is told when (monotonic), whether it was sent, the bytes, and on which of an upstream's connections.
+
+No bytes mean that whoever would have sent them closed the connection. It must not block and must not raise.
+"""
 
 
 class Tap:
@@ -26,7 +29,7 @@ class Tap:
         """Tell it no more."""
         self._watchers = tuple(one for one in self._watchers if one is not watcher)
 
-    def tell(self, now: float, *, sent: bool, data: bytes) -> None:
+    def tell(self, now: float, *, sent: bool, data: bytes, connection: int = 0) -> None:
         """Bytes went out, or came in."""
         for watcher in self._watchers:
-            watcher(now, sent, data)
+            watcher(now, sent, data, connection)

@@ -304,6 +304,8 @@ class UpstreamLine(LineShell):
         now = self._clock.monotonic()
         if reason:
             self._say_dropped(reason, now)
+        if self.tap:
+            self.tap.tell(now, sent=not remote, data=b"", connection=link.number)
         del self._used[link.number]
         link.close()
         self._up.lost(now, remote=remote, channel=link.number)
@@ -355,6 +357,8 @@ class UpstreamLine(LineShell):
         engine = self._up
         self._acted_at = now = self._clock.monotonic()
         if data and link is not None:
+            if self.tap:
+                self.tap.tell(now, sent=False, data=data, connection=link.number)
             replies = self.stats.ok
             engine.receive(data, now, link.number)
             if self._unheard_of and self.stats.ok > replies:
@@ -378,6 +382,8 @@ class UpstreamLine(LineShell):
             number = self._up.sent_on
             frames[number] = frames[number] + frame if number in frames else frame
         for number, data in frames.items():
+            if self.tap:
+                self.tap.tell(now, sent=True, data=data, connection=number)
             self._used[number].write(data)
 
     def _may_have_more(self, now: float) -> bool:

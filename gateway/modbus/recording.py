@@ -1,8 +1,10 @@
-"""The recording of a serial line: what was sent and received, byte for byte, and when.
+"""The recording of a line: what was sent and received, byte for byte, and when.
 
 Rule 1: a recording is text, JSON on each line: first an object that says what was recorded, then for each piece
-        `[seconds since the start, ">" sent or "<" received, bytes in hexadecimal]`, in the order of time.
-Rule 2: pieces are as the port gave them: a reply may come in several, and noise is in them.
+        `[seconds since the start, ">" sent or "<" received, bytes in hexadecimal]`, in the order of time; of a
+        Modbus TCP upstream with the number of the connection after it, where that is not 0.
+Rule 2: pieces are as the port gave them: a reply may come in several, and noise is in them. One without bytes means
+        that whoever would have sent them closed the connection.
 Rule 3: `Recording.parse` accepts what `header_line` and `Piece.line` write, or raises ValueError with the number of the
         line; nothing else.
 """
@@ -16,7 +18,8 @@ from typing import Any
 
 FORMAT = "prostar-gateway line recording 1"
 SENT, RECEIVED = ">", "<"
-LONGEST_PIECE = 4096
+LONGEST_PIECE = 16384
+_CONNECTIONS = range(8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,23 +29,28 @@ class Piece:
     at_s: float
     sent: bool
     data: bytes
+    connection: int = 0
 
     def line(self) -> str:
         """The piece as a line of the file, without its end."""
-        return f'[{self.at_s:.6f}, "{SENT if self.sent else RECEIVED}", "{self.data.hex()}"]'
+        connection = f", {self.connection}" if self.connection else ""
+        return f'[{self.at_s:.6f}, "{SENT if self.sent else RECEIVED}", "{self.data.hex()}"{connection}]'
 
     @classmethod
     def parse(cls, text: str) -> Piece:
         """The piece of a line; ValueError when it is none."""
         found = json.loads(text)
         match found:
-            case [int() | float() as at_s, str() as direction, str() as data] if direction in {SENT, RECEIVED}:
+            case [int() | float() as at_s, str() as direction, str() as data, *rest] if direction in {SENT, RECEIVED}:
                 octets = bytes.fromhex(data)
             case _:
                 raise ValueError("no piece of a recording")
-        if isinstance(at_s, bool) or not 0 <= at_s < 1e9 or not 0 < len(octets) <= LONGEST_PIECE:
+        connection = rest[0] if len(rest) == 1 else 0 if not rest else None
+        if isinstance(at_s, bool) or type(connection) is not int or connection not in _CONNECTIONS:
             raise ValueError("no piece of a recording")
-        return cls(float(at_s), direction == SENT, octets)
+        if not 0 <= at_s < 1e9 or len(octets) > LONGEST_PIECE:
+            raise ValueError("no piece of a recording")
+        return cls(float(at_s), direction == SENT, octets, connection)
 
 
 @dataclass(frozen=True, slots=True)

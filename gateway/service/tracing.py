@@ -24,7 +24,7 @@ from typing import Any
 
 from gateway.clock import Clock
 from gateway.core.site import LinePort
-from gateway.lines.serial import SerialLine
+from gateway.lines.shell import LineShell
 from gateway.modbus.recording import Piece, header_line
 
 FILE_NAME = "trace"
@@ -92,19 +92,19 @@ class Tracer:
     async def _answer(self, question: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         name = json.loads(question)
         line = next((one for one in self._lines() if one.name == name), None)
-        if not isinstance(line, SerialLine):
-            names = ", ".join(one.name for one in self._lines() if isinstance(one, SerialLine))
-            self._refuse(writer, f"there is no serial line {json.dumps(name)}; there are: {names or 'none'}")
+        if not isinstance(line, LineShell):
+            names = ", ".join(one.name for one in self._lines())
+            self._refuse(writer, f"there is no line {json.dumps(name)}; there are: {names}")
             return
         began = self._clock.monotonic()
         lost = 0
 
-        def watch(now: float, sent: bool, data: bytes) -> None:  # noqa: FBT001 - as `Watcher` says
+        def watch(now: float, sent: bool, data: bytes, connection: int) -> None:  # noqa: FBT001 - as `Watcher` says
             nonlocal lost
             if writer.transport.get_write_buffer_size() > MOST_UNREAD:
                 lost += 1
                 return
-            writer.write(f"{Piece(now - began, sent, data).line()}\n".encode())
+            writer.write(f"{Piece(now - began, sent, data, connection).line()}\n".encode())
 
         writer.write(f"{header_line(_about(line, self._clock))}\n".encode())
         _log.info("event=trace line=%s state=on", line.name)
@@ -120,13 +120,10 @@ class Tracer:
         writer.write(f"{json.dumps({'error': reason})}\n".encode())
 
 
-def _about(line: SerialLine, clock: Clock) -> Mapping[str, Any]:
+def _about(line: LineShell, clock: Clock) -> Mapping[str, Any]:
     settings = line.settings
-    return {
-        "line": line.name,
-        "port": line.port,
-        "baudrate": settings.baudrate,
-        "parity": settings.parity,
-        "stopbits": settings.stopbits,
-        "began": datetime.fromtimestamp(clock.wall(), UTC).isoformat(timespec="milliseconds"),
-    }
+    wire: dict[str, Any] = {"protocol": "modbus-tcp"}
+    if settings.upstream is None:
+        wire = {"baudrate": settings.baudrate, "parity": settings.parity, "stopbits": settings.stopbits}
+    began = datetime.fromtimestamp(clock.wall(), UTC).isoformat(timespec="milliseconds")
+    return {"line": line.name, "port": line.port, **wire, "began": began}

@@ -82,7 +82,7 @@ def answers_of(recording: Recording) -> dict[bytes, deque[Answer]]:
     answers: dict[bytes, deque[Answer]] = {}
     request, asked_at = b"", 0.0
     pieces: list[tuple[float, bytes]] = []
-    for piece in (*recording.pieces, None):
+    for piece in (*(piece for piece in recording.pieces if piece.data), None):
         if piece is not None and not piece.sent:
             pieces.append((piece.at_s - asked_at, piece.data))
             continue

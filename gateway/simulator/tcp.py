@@ -6,23 +6,55 @@ import asyncio
 import socket
 import struct
 from types import TracebackType
-from typing import Self, cast
+from typing import Any, Generic, Protocol, Self, TypeVar, cast
 
 from gateway.clock import Clock, SystemClock
-from gateway.simulator.upstream import ServerConnection, SimulatedServer
 
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER: on, for no time: closing is a reset
 
 
-class TcpServer:
-    """A `SimulatedServer` that listens; use it as an async context manager, or `open` and `close` it.
+class Connection(Protocol):
+    """A connection as its server sees it (upstream.ServerConnection says what is what)."""
+
+    ended: str
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Bytes that the client wrote."""
+        ...
+
+    def next_event(self) -> float | None:
+        """When there is something for the client."""
+        ...
+
+    def take(self, now: float) -> bytes:
+        """The bytes for the client by now."""
+        ...
+
+    def client_closed(self) -> None:
+        """The client ended it."""
+        ...
+
+
+class Server(Protocol):
+    """What is behind the port; `refusing` lets no connection in."""
+
+    refusing: bool
+
+    def connect(self) -> Connection:
+        """A client connected."""
+        ...
+
+
+S = TypeVar("S", bound=Server)
+
+
+class TcpServer(Generic[S]):
+    """A server, mostly a `SimulatedServer`, that listens; use it as an async context manager, or `open` and `close` it.
 
     Port 0 takes a free one; `port` is the real one while it listens, and stays the same when it is opened again.
     """
 
-    def __init__(
-        self, server: SimulatedServer, *, host: str = "127.0.0.1", port: int = 0, clock: Clock | None = None
-    ) -> None:
+    def __init__(self, server: S, *, host: str = "127.0.0.1", port: int = 0, clock: Clock | None = None) -> None:
         self.server = server
         self.host = host
         self.port = port
@@ -74,10 +106,10 @@ class TcpServer:
 class _Peer(asyncio.Protocol):
     """One client's connection."""
 
-    def __init__(self, owner: TcpServer, clock: Clock) -> None:
+    def __init__(self, owner: TcpServer[Any], clock: Clock) -> None:
         self._owner = owner
         self._clock = clock
-        self._connection: ServerConnection | None = None
+        self._connection: Connection | None = None
         self._transport: asyncio.Transport | None = None
         self._timer: asyncio.TimerHandle | None = None
 

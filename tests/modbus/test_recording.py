@@ -14,7 +14,8 @@ PIECES = st.lists(
         Piece,
         st.integers(0, 10**12).map(lambda micros: micros / 1e6),
         st.booleans(),
-        st.binary(min_size=1, max_size=300),
+        st.binary(max_size=300),
+        st.integers(0, 7),
     )
 )
 
@@ -41,13 +42,15 @@ def test_anything_else_is_a_value_error(lines: list[str], header: bool) -> None:
 @pytest.mark.parametrize(
     ("line", "number"),
     [
-        ('[1.0, ">", ""]', 2),
+        ('[1.0, ">"]', 2),
         ('[-1.0, ">", "00"]', 2),
         ('[true, ">", "00"]', 2),
         ('[NaN, ">", "00"]', 2),
         ('[1.0, "=", "00"]', 2),
         ('[1.0, ">", "0"]', 2),
-        ('[1.0, ">", "00", 1]', 2),
+        ('[1.0, ">", "00", 8]', 2),
+        ('[1.0, ">", "00", true]', 2),
+        ('[1.0, ">", "00", 1, 1]', 2),
         ("[" * 5000, 2),
         ('[2.0, ">", "00"]\n[1.0, ">", "00"]', 3),
     ],

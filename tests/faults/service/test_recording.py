@@ -7,9 +7,14 @@ import contextlib
 import socket
 import stat
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
+from gateway.devices.schema import load_map
 from gateway.modbus.recording import Recording
+from gateway.simulator.device import SimulatedController
+from gateway.simulator.tcp import TcpServer
+from gateway.simulator.upstream import Habits, SimulatedServer
 from tests.e2e.programs import GATEWAY, REPOSITORY, Program
 from tests.faults.service.rig import Service, client, until
 
@@ -61,6 +66,46 @@ async def test_a_recording_replays_into_a_gateway(service: Service, tmp_path: Pa
     assert "unknown=0" in replay.log()
 
 
+async def test_an_upstream_is_recorded_and_replayed_too(
+    service: Service, tmp_path: Path, free_tcp_port: Callable[[], int]
+) -> None:
+    units = [SimulatedController(load_map("tristar-mppt"), address=k) for k in (1, 2)]
+    config, recording = tmp_path / "upstream.toml", tmp_path / "upstream.rec"
+    text = f'site = "s"\nstate_dir = "{tmp_path}"\n{FAST}[modbus]\nlisten = []\n[snmp]\nlisten = []\n'
+    text += '[http]\nlisten = []\n[history]\nenabled = false\n[[line]]\nname = "far"\nport = "tcp://127.0.0.1:PORT"\n'
+    for k in (1, 2):
+        text += f'[[line.device]]\nname = "t-{k}"\naddress = {k}\nunit_id = {k}\nmodel = "tristar-mppt"\n'
+    simulated = SimulatedServer(units, habits=Habits(closes=True))
+    simulated.refusing = True  # so that the recording has the first questions too
+    async with TcpServer(simulated) as server:
+        config.write_text(text.replace("PORT", str(server.port)))
+        gateway = Program([*GATEWAY, "run", "-c", str(config)])
+        service.programs.append(gateway)
+        await until((tmp_path / "trace").exists)
+        record = Program([*GATEWAY, "record", "-c", str(config), "far", str(recording), "--seconds", "60"])
+        service.programs.append(record)
+        await until(lambda: "event=trace line=far state=on" in gateway.log())
+        simulated.refusing = False
+        await until(lambda: gateway.log().count("event=device_online") == 2)
+        traced = await command("trace", "-c", str(config), "far", "--seconds", "1")
+        assert traced.stdout.startswith("far at tcp://127.0.0.1:")
+        assert " closed\n" in traced.stdout
+        assert await asyncio.to_thread(record.end) == 0
+        assert await asyncio.to_thread(gateway.end) == 0
+
+    port = str(free_tcp_port())
+    replay = Program([*GATEWAY, "replay", str(recording), "--port", port])
+    service.programs.append(replay)
+    config.write_text(text.replace("PORT", port))
+    gateway = Program([*GATEWAY, "run", "-c", str(config)])
+    service.programs.append(gateway)
+    await until(lambda: gateway.log().count("event=device_online") == 2)
+    assert await asyncio.to_thread(gateway.end) == 0
+    assert await asyncio.to_thread(replay.end) == 0
+    assert "unknown=0" in replay.log()
+    assert (await command("replay", str(recording), "--link", str(tmp_path / "link"))).returncode == 1
+
+
 async def test_tracing_ends_with_who_asked_and_is_for_nobody_else(service: Service) -> None:
     service.configure(rest=FAST)
     service.start()
@@ -75,7 +120,7 @@ async def test_tracing_ends_with_who_asked_and_is_for_nobody_else(service: Servi
     await service.log("event=trace line=shelter-a state=off")
     unknown = await command("trace", "-c", str(service.config), "elsewhere")
     assert unknown.returncode == 1
-    assert unknown.stderr == 'there is no serial line "elsewhere"; there are: shelter-a\n'
+    assert unknown.stderr == 'there is no line "elsewhere"; there are: shelter-a\n'
     for nonsense in (b"", b"\n", b"[" * 900 + b"\n", b"\xff\n", b'{"a": 1}\n', b"x" * 5000):
         with socket.socket(socket.AF_UNIX) as sock:
             sock.connect(str(path))
