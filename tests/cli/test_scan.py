@@ -9,7 +9,7 @@ import signal
 import sys
 import termios
 import tomllib
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from gateway.core.settings import LineSettings
 from gateway.devices.model import DeviceMap, Identification
 from gateway.devices.schema import load_map
 from gateway.errors import ConfigError
-from gateway.lines.scan import Found
+from gateway.lines.looking import Found
 from gateway.modbus.rtu import Timing
 from gateway.service.config import parse_config
 from gateway.simulator.device import SimulatedController
@@ -30,6 +30,8 @@ from gateway.simulator.line import SimulatedLine, Station
 from gateway.simulator.medium import Burst, CleanMedium
 from gateway.simulator.oracle import OracleController
 from gateway.simulator.pty import PtyLine
+from gateway.simulator.tcp import TcpServer
+from gateway.simulator.upstream import Habits, SimulatedServer
 
 MAP: DeviceMap = load_map("prostar-mppt")
 FAST = 115200
@@ -147,6 +149,31 @@ async def test_the_speed_is_found_too(tmp_path: Path) -> None:
     assert status == 0
     config = parse_config(f'site = "here"\n{toml}')
     assert [(line.baudrate, [device.address for device in line.device]) for line in config.line] == [(19200, [2])]
+
+
+@pytest.mark.parametrize("closes", [False, True])
+async def test_the_controllers_behind_a_modbus_tcp_server_are_found_too(closes: bool) -> None:
+    tristar = SimulatedController(load_map("tristar-mppt"), address=1, turnaround_s=0.002)
+    stations = (tristar, Unnamed(MAP, device=1, address=5, turnaround_s=0.002))
+    habits = Habits(closes=closes, silence=None if closes else 0x0B, patience_s=0.01)
+    async with TcpServer(SimulatedServer(stations, habits=habits)) as server:
+        status, toml, said = await scanned(server.url, "--addresses", "1-6", "--timeout-s", "0.5")
+    assert status == 0
+    assert "2 found." in said
+    line = tomllib.loads(toml)["line"][0]
+    assert (line["port"], addresses(toml)) == (server.url, [1, 5])
+    assert line["device"][0]["product"] == tristar.plant.product
+    named = toml.partition('\n\n  [[line.device]]\n  name = "array-5"')[0]
+    assert parse_config(f'site = "here"\n{named}').line[0].device[0].model == "tristar-mppt"
+    assert not tristar.writes
+
+
+async def test_a_server_that_is_not_there_or_has_no_port_is_said(free_tcp_port: Callable[[], int]) -> None:
+    port = free_tcp_port()
+    status, toml, said = await scanned(f"tcp://127.0.0.1:{port}")
+    assert (status, toml) == (1, "")
+    assert f"127.0.0.1:{port}: connection refused" in said
+    assert (await scanned("tcp://127.0.0.1"))[0] == 2
 
 
 async def test_a_late_answer_is_asked_for_again_with_patience(tmp_path: Path) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from gateway.lines import scan
-from gateway.lines.scan import PROBE, Found, Scanner
+from gateway.lines.looking import PROBE, Found
+from gateway.lines.scan import Scanner
 from gateway.modbus.crc import append_crc
 from gateway.modbus.rtu import Timing
 
