@@ -133,8 +133,32 @@ TriStars, whose loads hang on the battery and not on them: a 24 V one without a 
 
 
 def plants_of(device_map: DeviceMap) -> tuple[Plant, ...]:
-    """The installations that a model can be bolted to."""
-    return tuple(plant for plant in PLANTS if device_map.identity.names(plant.product))
+    """The installations that a model can be bolted to: those above, else the one that its map tells of."""
+    named = tuple(plant for plant in PLANTS if device_map.identity.names(plant.product))
+    return named or (_plant_of(device_map),)
+
+
+def _plant_of(device_map: DeviceMap) -> Plant:
+    """A 12 V installation for a model that is only a map: as large as its charge counter may grow quickly."""
+    identity = device_map.identity
+    rates = [rule.per_hour for rule in identity.growing if rule.point == "charge_total"]
+    rated_a = float(rates[0]) if rates else 20.0
+    return Plant(
+        product=next(iter((*identity.product_codes, *identity.product_prefixes, device_map.model))),
+        nominal_v=12,
+        rated_a=rated_a,
+        array_w=14.0 * rated_a,
+        array_voc_v=43.0,
+        battery_ah=9.0 * rated_a,
+        soc_at_start=0.75,
+        base_load_a=0.12 * rated_a,
+        lamp_a=0.1 * rated_a,
+        has_rts=False,
+        warmth_c=24.0,
+        heatsink_c_per_w=50.0 / (14.0 * rated_a),
+        days_since_equalize=10,
+        age_days=200,
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
@@ -225,3 +226,19 @@ def test_high_voltage_set_points_trip_and_recover(make: Make) -> None:
     assert (masks.battery_hvd, masks.load_hvd) in faults
     assert (0, 0) in faults
     assert unit.day.today.array_faults == masks.battery_hvd
+
+
+@pytest.mark.parametrize("counted", [True, False])
+def test_a_model_that_is_only_a_map_has_an_installation_too(prostar_map: DeviceMap, counted: bool) -> None:
+    identity = replace(prostar_map.identity, product_prefixes=(), product_codes=("ACME-30",))
+    if not counted:
+        identity = replace(identity, growing=())
+    unit = SimulatedController(replace(prostar_map, model="acme", identity=identity), start_hour=0.0)
+    unit.advance(0.0)
+    most_a = 0.0
+    for _ in seconds(unit, DAY, 60.0):
+        now = unit.day.now
+        most_a = max(most_a, now.charge_a)
+        assert 11.0 < now.battery_v < unit.day.points.hvd_v
+    assert unit.plant.product == "ACME-30"
+    assert 0.3 * unit.plant.rated_a < most_a <= unit.plant.rated_a
