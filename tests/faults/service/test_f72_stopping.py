@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import socket
+import struct
 import time
 from collections.abc import Callable
 
@@ -65,6 +68,32 @@ async def test_a_controller_that_takes_for_ever_is_given_up_after_five_seconds(s
         assert await asker.reply() == b""
     assert await service.end() == 0
     assert time.monotonic() - began < 10.0
+    assert "Traceback" not in program.log()
+
+
+async def test_a_client_that_reads_nothing_is_cut_off(service: Service) -> None:
+    """What it was told already fills every buffer on the way, so that its connection cannot be closed in order."""
+    service.configure(rest="[poll]\nlive_s = 0.2\n")
+    program = service.start()
+    await service.online()
+    with socket.socket() as deaf:
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+        deaf.connect(("127.0.0.1", service.modbus))
+        deaf.setblocking(False)
+        asked = b"".join(struct.pack(">HHHB", tid, 0, 6, 11) + read(0, 80) for tid in range(500))
+        sent = 0
+        with contextlib.suppress(BlockingIOError):
+            while sent < 1 << 26:  # until nothing more is taken: the gateway reads no more from who reads nothing
+                sent += deaf.send(asked)
+                await asyncio.sleep(0.001)
+        assert sent < 1 << 26
+        async with client(service.modbus) as other:
+            assert (await other.read(11))[:2] == b"\x03\x04"
+            began = time.monotonic()
+            program.process.terminate()
+            assert await other.reply() == b""
+        assert await service.end() == 0  # the deaf one's socket is still open
+    assert time.monotonic() - began < 8.0
     assert "Traceback" not in program.log()
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import re
 import signal
+import sys
 
+from tests.e2e.programs import Program
 from tests.faults.service.rig import QUIET, NotifySocket, Service
 
 
@@ -45,6 +47,31 @@ async def test_an_unplugged_line_and_a_dead_controller_do_not_starve_it(
     assert told == "WATCHDOG=1\nSTATUS=0 of 3 controllers online; 2 of 2 lines down"
     assert (await service.get("/healthz"))[0] == 200
     assert (await service.get("/readyz"))[0] == 200
+
+
+HANGING = """
+from gateway.lines.serial import SerialLine
+SerialLine.overdue_s = lambda self, now: 60.0
+from gateway.cli.main import main
+main()
+"""
+"""The gateway with a line that leaves undone what it should have done long ago."""
+
+
+async def test_a_line_that_hangs_starves_it_although_the_loop_turns(service: Service, systemd: NotifySocket) -> None:
+    service.configure(rest=QUIET)
+    program = Program(
+        [sys.executable, "-c", HANGING, "run", "-c", str(service.config)],
+        NOTIFY_SOCKET=systemd.path,
+        WATCHDOG_USEC="400000",
+    )
+    service.programs.append(program)
+    await service.log('event=watchdog_not_fed stuck="line shelter-a"')
+    systemd.drain()
+    await asyncio.sleep(0.5)
+    assert (await service.get("/healthz"))[0] == 200
+    assert [told for told in systemd.drain() if "WATCHDOG" in told] == []
+    assert await service.end() == 0
 
 
 async def test_a_loop_that_stands_still_starves_it(service: Service, systemd: NotifySocket) -> None:

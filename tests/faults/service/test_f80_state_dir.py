@@ -13,31 +13,34 @@ from tests.e2e.programs import GATEWAY, Program
 from tests.faults.service.rig import Service, client
 from tests.faults.service.test_f78_reload import A1, LINE_KEYS, snmp_get, user
 
-MOUNTED = ["unshare", "--mount", "sh", "-c", 'mount -t tmpfs -o size=4k none "$DIR" && exec "$0" "$@"']
-"""Runs a program for which the folder $DIR is a disk of one block."""
+MOUNTED = ["unshare", "--mount", "sh", "-c", 'mount -t tmpfs -o "$HOW" none "$DIR" && exec "$0" "$@"']
+"""Runs a program for which the folder $DIR is another disk, mounted as $HOW says."""
+
+DISKS = {"full": "size=4k", "read-only": "ro"}
 
 RAISED = re.compile(r'^prostar_gateway_condition\{.*condition="state_dir_unusable".*\} 1\.0$', re.MULTILINE)
 
 
 def may_mount(folder: str) -> bool:
     """Whether a namespace and a file system in it can be made here."""
-    done = subprocess.run([*MOUNTED, "true"], env={"DIR": folder, "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"}, check=False)
+    variables = {"DIR": folder, "HOW": "ro", "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"}
+    done = subprocess.run([*MOUNTED, "true"], env=variables, check=False)
     return done.returncode == 0
 
 
 @pytest.mark.peer
-@pytest.mark.parametrize("kind", ["full", "cannot be made"])
+@pytest.mark.parametrize("kind", [*DISKS, "cannot be made"])
 async def test_data_are_served_and_everybody_is_told(service: Service, peer: Callable[[str], str], kind: str) -> None:
     snmpget = peer("snmpget")
     table, noc = user("noc", service.folder, "correct-horse-1")
     service.configure((A1,), f"[poll]\nlive_s = 0.2\n{table}", LINE_KEYS)
     run = [*GATEWAY, "run", "-c", str(service.config)]
-    if kind == "full":
+    if kind in DISKS:
         folder = service.folder / "state"
         folder.mkdir()
         if not may_mount(str(folder)):
             pytest.skip("needs the right to mount")
-        program = Program([*MOUNTED, *run], DIR=str(folder))
+        program = Program([*MOUNTED, *run], DIR=str(folder), HOW=DISKS[kind])
     else:
         text = service.config.read_text()
         service.config.write_text(text.replace(f'state_dir = "{service.folder}/state"', 'state_dir = "/proc/none"'))

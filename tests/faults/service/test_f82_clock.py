@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import signal
 import subprocess
 import time
 from collections.abc import Callable
@@ -15,15 +16,13 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.programs import environment
-from tests.faults.service.rig import Service
+from tests.faults.service.rig import Service, client
 from tests.faults.service.test_f78_reload import LINE_KEYS, reading, user
 
 LIBRARY = "libfaketimeMT.so.1"
 START, DAY_S = -20_000 * 86_400, 86_400
 STEPS = (0, 3_600, 0, 365 * DAY_S, 0)
 """What the clock is set to, in seconds from now: from 1972 to now, by an hour and a year forth and back."""
-
-pytestmark = pytest.mark.peer
 
 
 @pytest.fixture
@@ -74,6 +73,31 @@ async def is_set(service: Service, started_at: float) -> None:
             await asyncio.sleep(0.05)
 
 
+async def test_after_a_suspend_there_is_one_round_of_polls_and_no_burst(service: Service) -> None:
+    """The process stands still for a while, as it does when the machine sleeps."""
+    service.configure((("shelter-a", "array-1", 1, 11),), "[poll]\nlive_s = 0.2\n", LINE_KEYS)
+    program = service.start()
+    await service.online()
+    unit = service.units["shelter-a"][0]
+    await asyncio.sleep(1.0)
+    live = max(set(unit.asked), key=unit.asked.count)  # the poll that comes most often
+    program.process.send_signal(signal.SIGSTOP)
+    await asyncio.sleep(3.0)  # fifteen rounds that are missed
+    loop = asyncio.get_running_loop()
+    before, woken = unit.asked.count(live), loop.time()
+    program.process.send_signal(signal.SIGCONT)
+    async with client(service.modbus) as asker:
+        assert (await asker.read(11))[:2] == b"\x03\x04"
+        await asyncio.sleep(1.0)
+    assert 0 < unit.asked.count(live) - before < 3 + 5 * (loop.time() - woken)
+    await service.online()
+    log = program.log()
+    for trouble in ("line_down", "device_offline", "Traceback"):
+        assert trouble not in log
+    assert await service.end() == 0
+
+
+@pytest.mark.peer
 async def test_nobody_notices(
     service: Service, faked: Callable[[int], dict[str, str]], peer: Callable[[str], str]
 ) -> None:
