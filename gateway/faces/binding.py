@@ -1,10 +1,13 @@
-"""Why an address cannot be listened on, in the same words on every face."""
+"""How a TCP face comes to listen on an address, and why it cannot, in the same words on every face."""
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import os
 import socket
+
+BACKLOG = 128
 
 _REASONS = {
     errno.EADDRINUSE: "another program listens there",
@@ -20,3 +23,21 @@ def bind_problem(error: OSError) -> str:
         return "the name does not resolve to an address"
     number = error.errno or 0
     return _REASONS.get(number) or (os.strerror(number) if number > 0 else error.strerror or str(error))
+
+
+async def listening_socket(host: str, port: int) -> socket.socket:
+    """A socket that listens on one address of one family; OSError when it cannot be had."""
+    loop = asyncio.get_running_loop()
+    (family, kind, protocol, _, address), *_ = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    sock = socket.socket(family, kind, protocol)
+    try:
+        sock.settimeout(0.0)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if family == socket.AF_INET6:
+            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        sock.bind(address)
+        sock.listen(BACKLOG)
+    except BaseException:
+        sock.close()
+        raise
+    return sock

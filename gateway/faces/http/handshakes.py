@@ -15,11 +15,11 @@ import ssl
 from collections.abc import Callable
 from contextlib import suppress
 
+from gateway.faces.binding import listening_socket
 from gateway.faces.http.own import HttpStats
 
 ACCEPT_TURN = 32
 ACCEPT_PAUSE_S = 1.0
-BACKLOG = 128
 
 _NO_DESCRIPTORS = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
@@ -54,12 +54,9 @@ class Handshakes:
         host, port, *_ = self._sock.getsockname()
         return host, port
 
-    def open(self, host: str, port: int) -> None:
+    async def open(self, host: str, port: int) -> None:
         """Listen; OSError when that cannot be."""
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        sock = socket.create_server((host, port), family=family, backlog=BACKLOG)
-        sock.settimeout(0.0)
-        self._sock = sock
+        self._sock = sock = await listening_socket(host, port)
         asyncio.get_running_loop().add_reader(sock, self._accept)
 
     async def close(self) -> None:

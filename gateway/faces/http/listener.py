@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from gateway.clock import Clock
 from gateway.errors import ListenError
-from gateway.faces.binding import bind_problem
+from gateway.faces.binding import BACKLOG, bind_problem, listening_socket
 from gateway.faces.http.access import load_certificate, tls_context
 from gateway.faces.http.connection import Connections
 from gateway.faces.http.handshakes import Handshakes
@@ -71,11 +71,11 @@ class HttpListener:
         self._connections = connections = Connections(self._settings, handler, self._clock, self._stats)
         try:
             if tls is None:
-                loop = asyncio.get_running_loop()
-                self._server = await loop.create_server(self._accept, self._host, self._port)
+                sock = await listening_socket(self._host, self._port)
+                self._server = await asyncio.get_running_loop().create_server(self._accept, sock=sock, backlog=BACKLOG)
             else:
                 self._handshakes = self._way_in(tls, connections)
-                self._handshakes.open(self._host, self._port)
+                await self._handshakes.open(self._host, self._port)
         except OSError as error:
             await self.stop()
             raise ListenError(f"{self.label}: {bind_problem(error)}") from error

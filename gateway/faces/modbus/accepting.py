@@ -24,7 +24,6 @@ logger = logging.getLogger(__name__)
 ACCEPT_TURN = 32
 ACCEPT_PAUSE_S = 1.0
 SPARE_DESCRIPTORS = 32
-BACKLOG = 128
 
 _NO_DESCRIPTORS = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
@@ -78,21 +77,3 @@ class Acceptor:
     def _again(self) -> None:
         self._pause = None
         self._hub.change(self.sock.fileno(), select.EPOLLIN)
-
-
-async def listening_socket(host: str, port: int) -> socket.socket:
-    """A socket that listens on one address of one family; OSError when it cannot be had."""
-    loop = asyncio.get_running_loop()
-    (family, kind, protocol, _, address), *_ = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-    sock = socket.socket(family, kind, protocol)
-    try:
-        sock.settimeout(0.0)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        if family == socket.AF_INET6:
-            sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
-        sock.bind(address)
-        sock.listen(BACKLOG)
-    except BaseException:
-        sock.close()
-        raise
-    return sock

@@ -28,8 +28,8 @@ from gateway.core.site import Site
 from gateway.core.stats import ModbusServerStats, TlsStats
 from gateway.core.status_registers import StatusRegisters
 from gateway.errors import ListenError, TlsFilesError
-from gateway.faces.binding import bind_problem
-from gateway.faces.modbus.accepting import Acceptor, listening_socket
+from gateway.faces.binding import bind_problem, listening_socket
+from gateway.faces.modbus.accepting import Acceptor
 from gateway.faces.modbus.admission import decide, rate_of
 from gateway.faces.modbus.connection import Connection
 from gateway.faces.modbus.dispatch import Dispatcher, Routes, Shared

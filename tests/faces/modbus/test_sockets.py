@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from gateway.faces.modbus.accepting import ACCEPT_PAUSE_S, Acceptor, listening_socket
+from gateway.faces.binding import listening_socket
+from gateway.faces.modbus.accepting import ACCEPT_PAUSE_S, Acceptor
 from gateway.faces.modbus.sockets import FIRST_BYTES, READ_BYTES, TURN, Hub, SocketTransport
 
 

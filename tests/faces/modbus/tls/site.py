@@ -109,6 +109,9 @@ class Pki:
             builder = builder.add_extension(extension, critical=False)
         signer = load_pem_private_key((self.folder / f"{issuer}.key").read_bytes(), None)
         assert isinstance(signer, ec.EllipticCurvePrivateKey)
+        if usage == SERVER:  # a client with Python 3.13 or newer refuses a server without it
+            by = x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.public_key())
+            builder = builder.add_extension(by, critical=False)
         self._write(name, builder.sign(signer, hashes.SHA256()))
         self._write_key(name, key)
 
