@@ -15,7 +15,7 @@ Times are monotonic. `look` is cheap when nothing changed and may be called at a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -92,6 +92,48 @@ def bit_conditions(device_map: DeviceMap) -> Iterator[tuple[str, int, Condition]
             yield point.name, bit.number, Condition(point.conditions.first + bit.number, name, bit.text, severity)
 
 
+@dataclass(frozen=True, slots=True)
+class _OfModel:
+    """What all devices of a model can have, in the order of their codes but for the gateway's own."""
+
+    map: DeviceMap
+    conditions: tuple[Condition, ...]
+    places: Mapping[int, int]  # of the conditions, by code
+    bits: tuple[tuple[str, tuple[tuple[int, int], ...]], ...]  # point and, for each bit, its mask and its condition
+
+
+_MODELS_KEPT = 32
+_models: dict[tuple[int, bool], _OfModel] = {}
+
+
+def _of_model(device_map: DeviceMap, *, auto: bool) -> _OfModel:
+    """Made once for all devices of a map, since it is dozens of texts."""
+    key = (id(device_map), auto)
+    known = _models.get(key)
+    if known is None or known.map is not device_map:
+        if len(_models) >= _MODELS_KEPT:
+            _models.clear()
+        known = _models[key] = _look_up(device_map, auto=auto)
+    return known
+
+
+def _look_up(device_map: DeviceMap, *, auto: bool) -> _OfModel:
+    conditions: list[Condition] = []
+    bits: dict[str, list[tuple[int, int]]] = {}
+    for point, number, condition in bit_conditions(device_map):
+        conditions.append(condition)
+        bits.setdefault(point, []).append((1 << number, condition.code))
+    conditions += [OFFLINE, MISMATCH, REWRITE]
+    conditions += [LOAD_OFF] if device_map.load is not None else []
+    conditions += [MODEL] if auto else []
+    return _OfModel(
+        device_map,
+        tuple(conditions),
+        {condition.code: place for place, condition in enumerate(conditions)},
+        tuple((point, tuple(pairs)) for point, pairs in bits.items()),
+    )
+
+
 class Watch:
     """One condition of one subject: `device` or `line`, or the gateway where both are None."""
 
@@ -119,10 +161,12 @@ class Watch:
 class _Set:
     """The watches of one subject."""
 
-    def __init__(self, changed: dict[Watch, None]) -> None:
+    def __init__(self, changed: dict[Watch, None], watches: Iterable[Watch], places: Mapping[int, int]) -> None:
+        """`places` are those of the watches, by code."""
         self._changed = changed
         self._active = dict.fromkeys(Severity, 0)
-        self.by_code: dict[int, Watch] = {}
+        self._watches = list(watches)
+        self._places = places
 
     @property
     def active(self) -> Mapping[Severity, int]:
@@ -136,15 +180,16 @@ class _Set:
 
     def __iter__(self) -> Iterator[Watch]:
         """Every watch, by code."""
-        return iter(self.by_code.values())
+        return iter(self._watches)
 
-    def _add(
-        self, condition: Condition, now: float, device: Device | None = None, line: LinePort | None = None
-    ) -> None:
-        self.by_code[condition.code] = Watch(condition, now, device, line)
+    def __contains__(self, code: int) -> bool:
+        return code in self._places
+
+    def __getitem__(self, code: int) -> Watch:
+        return self._watches[self._places[code]]
 
     def _become(self, code: int, state: ConditionState, now: float) -> None:
-        watch = self.by_code[code]
+        watch = self[code]
         if state is watch.state:
             return
         severity = watch.condition.severity
@@ -167,20 +212,13 @@ class DeviceConditions(_Set):
     """The conditions of one device."""
 
     def __init__(self, device: Device, now: float, changed: dict[Watch, None]) -> None:
-        super().__init__(changed)
-        self.device = device
         self.map = device.map  # a model that is found later has conditions of its own
-        bits: dict[str, list[tuple[int, int]]] = {}
-        for point, number, condition in bit_conditions(self.map):
-            self._add(condition, now, device)
-            bits.setdefault(point, []).append((1 << number, condition.code))
-        self._bits = [(point, tuple(pairs)) for point, pairs in bits.items()]
+        of_model = _of_model(self.map, auto=device.auto)
+        watches = (Watch(condition, now, device, None) for condition in of_model.conditions)
+        super().__init__(changed, watches, of_model.places)
+        self.device = device
+        self._bits = of_model.bits
         self._values: list[Value | None] = [None] * len(self._bits)
-        own = [OFFLINE, MISMATCH, REWRITE]
-        own += [LOAD_OFF] if self.map.load is not None else []
-        own += [MODEL] if device.auto else []
-        for condition in own:
-            self._add(condition, now, device)
         self._seen: Snapshot | None = None
         self._line_open_since: float | None = None  # None: it is down
         self._again_at: float | None = None  # when the state can change without a new snapshot
@@ -238,7 +276,7 @@ class DeviceConditions(_Set):
         if now >= stale_until:
             return ConditionState.RAISED
         self._again_at = stale_until
-        return self.by_code[OFFLINE.code].state
+        return self[OFFLINE.code].state
 
     def _load(self, shown: Mapping[str, Value]) -> ConditionState:
         rule = self.map.load
@@ -256,20 +294,18 @@ class GatewayConditions(_Set):
     def __init__(
         self, lines: Sequence[LinePort], own: Sequence[Condition], now: float, changed: dict[Watch, None]
     ) -> None:
-        super().__init__(changed)
-        for condition in own:
-            self._add(condition, now)
-        for line in lines:
-            self._add(line_condition(line.index), now, line=line)
+        watches = [Watch(condition, now, None, None) for condition in own]
+        watches += [Watch(line_condition(line.index), now, None, line) for line in lines]
+        super().__init__(changed, watches, {watch.condition.code: place for place, watch in enumerate(watches)})
         self._raised_since: dict[int, float] = {}
 
     def go_on(self, before: GatewayConditions) -> None:
         """Take over what is known of the same conditions: of the gateway itself, and of lines that stayed."""
         self._raised_since = before._raised_since
-        for code, watch in before.by_code.items():
-            mine = self.by_code.get(code)
-            if mine is not None and mine.line is watch.line:
-                self.by_code[code] = watch
+        for watch in before:
+            place = self._places.get(watch.condition.code)
+            if place is not None and self._watches[place].line is watch.line:
+                self._watches[place] = watch
                 if watch.state is ConditionState.RAISED:
                     self._active[watch.condition.severity] += 1
 
@@ -287,7 +323,7 @@ class GatewayConditions(_Set):
 
         Nothing is done where the gateway has no such condition.
         """
-        if condition.code not in self.by_code:
+        if condition.code not in self:
             return
         if not raised:
             self._raised_since.pop(condition.code, None)

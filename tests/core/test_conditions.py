@@ -69,7 +69,7 @@ class Plant:
 
     def watch(self, code: int, unit_id: int = 7) -> Watch:
         of = self.conditions.devices[unit_id] if unit_id else self.conditions.gateway
-        return of.by_code[code]
+        return of[code]
 
     def worst(self) -> Severity | None:
         return self.conditions.devices[7].worst
@@ -213,7 +213,7 @@ def test_the_load_is_disconnected_by_the_states_that_the_map_names(state: int, w
 def test_a_model_without_load_has_no_such_condition() -> None:
     plant = Plant(device_map=replace(MAP, load=None))
     plant.shows(load_state=3)
-    assert 404 not in plant.conditions.devices[7].by_code
+    assert 404 not in plant.conditions.devices[7]
 
 
 def test_what_the_gateway_is_told_of_itself() -> None:
@@ -255,11 +255,11 @@ def test_another_site_goes_on_with_what_is_known_of_the_same_lines_and_devices()
     site = Site.of("s", (plant.line, other), [plant.device, new])
     plant.conditions = Conditions(site, (module.HISTORY_DOWN,), plant.now, plant.conditions)
     gateway = plant.conditions.gateway
-    assert plant.conditions.devices[7].by_code[100] is before[100]
-    assert gateway.by_code[451] is before[451]
-    assert gateway.by_code[1001] is before[1001]
-    assert gateway.by_code[1002].state is UNKNOWN
-    assert 453 not in gateway.by_code
+    assert plant.conditions.devices[7][100] is before[100]
+    assert gateway[451] is before[451]
+    assert gateway[1001] is before[1001]
+    assert gateway[1002].state is UNKNOWN
+    assert 453 not in gateway
     assert {severity.name: count for severity, count in gateway.active.items()} == {
         "INFO": 0,
         "WARNING": 1,
@@ -268,10 +268,10 @@ def test_another_site_goes_on_with_what_is_known_of_the_same_lines_and_devices()
     plant.line.state = LineState.OPEN
     plant.wait(1.0)
     assert gateway.worst is Severity.WARNING
-    assert plant.conditions.devices[8].by_code[100].state is UNKNOWN
+    assert plant.conditions.devices[8][100].state is UNKNOWN
     moved = Conditions(Site.of("s", (other,), [new]), (module.HISTORY_DOWN,), plant.now, plant.conditions)
     assert list(moved.devices) == [8]
-    assert 1001 not in moved.gateway.by_code
+    assert 1001 not in moved.gateway
 
 
 def test_a_look_without_news_changes_nothing() -> None:

@@ -21,7 +21,7 @@ Lines = Sequence[bytes]
 """Sample lines in pieces, each of whole lines."""
 
 _OPENMETRICS_VERSIONS = ("", "0.0.1", "1.0.0")
-_NUMBERS_KEPT = 16384
+_NUMBERS_KEPT = 8192
 _TEXT_VERSIONS = ("", "0.0.4")
 _WEIGHT = re.compile(r"(?:0(?:\.\d{0,3})?|1(?:\.0{0,3})?)")
 

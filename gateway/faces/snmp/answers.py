@@ -30,7 +30,7 @@ TOLD = 1000
 """Of so many answers that failed for a mistake of ours, one is logged: a datagram is quickly sent."""
 
 MOST_ANSWERS = 4096
-MOST_OCTETS = 4 << 20
+MOST_OCTETS = 2 << 20
 _OBJECT_OCTETS = 500
 """What an answer takes besides its octets, about."""
 

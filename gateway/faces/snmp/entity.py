@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from enum import IntEnum
 
 from gateway.core.site import Device
@@ -35,6 +35,7 @@ from gateway.faces.snmp.objects import (
     Table,
     text,
 )
+from gateway.faces.snmp.rows import NumberedRows, Rows
 from gateway.faces.snmp.settings import Oid
 
 ENTITY_MIB: Oid = (1, 3, 6, 1, 2, 1, 47)
@@ -83,14 +84,33 @@ def sensors(device_map: DeviceMap) -> list[Point]:
     return sorted(found, key=_column)
 
 
-def entities(gateway: Gateway) -> Iterator[EntityRow]:
-    """Every physical entity: the gateway, then each device followed by its sensors."""
-    yield EntityRow(gateway, GATEWAY_INDEX, 0)
-    for place, device in enumerate(gateway.site.devices, start=1):
-        index = device.unit_id * INDEXES_A_DEVICE
-        yield EntityRow(gateway, index, place, device=device)
-        for position, point in enumerate(sensors(device.map), start=1):
-            yield EntityRow(gateway, index + _column(point), position, device=device, point=point)
+def entities(gateway: Gateway, *, sensors_only: bool = False) -> Rows:
+    """The physical entities: the gateway, then each device followed by its sensors; or the sensors alone."""
+    devices = gateway.site.devices
+    order = {device.unit_id: place for place, device in enumerate(devices, start=1)}
+    measured = {id(each): sensors(each) for each in {id(device.map): device.map for device in devices}.values()}
+    by_column = {
+        key: {_column(point): (position, point) for position, point in enumerate(points, start=1)}
+        for key, points in measured.items()
+    }
+    # What a device measures is that of its map now, even if another one is found for it later.
+    of_unit = {device.unit_id: (device, by_column[id(device.map)]) for device in devices}
+
+    def row(unit: int, column: int) -> EntityRow:
+        if not unit:
+            return EntityRow(gateway, GATEWAY_INDEX, 0)
+        device, points = of_unit[unit]
+        index = unit * INDEXES_A_DEVICE + column
+        if not column:
+            return EntityRow(gateway, index, order[unit], device=device)
+        position, point = points[column]
+        return EntityRow(gateway, index, position, device=device, point=point)
+
+    numbers = [] if sensors_only else [GATEWAY_INDEX]
+    for unit, (_, points) in of_unit.items():
+        columns = points if sensors_only else (0, *points)
+        numbers += [unit * INDEXES_A_DEVICE + column for column in columns]
+    return NumberedRows(numbers, INDEXES_A_DEVICE, row, lambda unit: of_unit[unit][0] if unit else None)
 
 
 def _measures(point: Point) -> bool:

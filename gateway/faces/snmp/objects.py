@@ -14,7 +14,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum, StrEnum
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 from gateway.core.conditions import Conditions, DeviceConditions, Watch
 from gateway.core.site import Device, LinePort, Site
@@ -98,9 +99,11 @@ class DeviceRow:
     device: Device
 
 
-@dataclass(frozen=True, slots=True)
-class ConditionRow:
-    """A row of the condition table; `of` are the conditions of its device, None for those of the gateway."""
+class ConditionRow(NamedTuple):
+    """A row of the condition table; `of` are the conditions of its device, None for those of the gateway.
+
+    A tuple, for it is made whenever a cell of it is asked for (rows.py).
+    """
 
     gateway: Gateway
     watch: Watch
@@ -123,12 +126,11 @@ class CapabilityRow:
     position: int  # 0-based
 
 
-@dataclass(frozen=True, slots=True)
-class EntityRow:
-    """A row of entPhysicalTable: the gateway itself, a device of it, or what a device measures."""
+class EntityRow(NamedTuple):
+    """A row of entPhysicalTable: the gateway itself, a device of it, or what a device measures; a tuple as above."""
 
     gateway: Gateway
-    index: int
+    number: int  # its index
     position: int  # among those with the same container, from 1
     device: Device | None = None
     point: Point | None = None  # with a device only
@@ -220,6 +222,7 @@ class Table:
     indexes: tuple[Index, ...] = ()  # its own index objects, behind the one that it borrows
 
 
+@lru_cache(maxsize=1024)
 def text(value: str) -> bytes:
     """`value` as PgwText: UTF-8, cut to 255 octets at a character."""
     return value.encode()[:255].decode(errors="ignore").encode()

@@ -13,11 +13,12 @@ The tail of a request (`singles.py`) is a frame, the column's prefix, the row's 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from gateway.core.site import Device
 from gateway.devices.model import Value
-from gateway.faces.snmp.columns import Column, Rows
+from gateway.faces.snmp.columns import Column
+from gateway.faces.snmp.rows import Rows
 
 Targets = Mapping[bytes, tuple[Device, bytes]]
 """By index and NULL of a request: the device of the row that is to be shown, and its index."""
@@ -54,12 +55,12 @@ class Routes:
         key = rows, ahead, index_size
         known = self._targets.get(key)
         if known is None:
-            known = {
-                suffix + _NULL: (device, shown)
-                for suffix, shown, device in zip(
-                    rows.suffixes, rows.suffixes[ahead:], rows.devices[ahead:], strict=False
-                )
-                if device is not None and len(suffix) == len(shown) == index_size
-            }
-            self._targets[key] = known
+            known = self._targets[key] = dict(_targets(rows, ahead, index_size))
         return known
+
+
+def _targets(rows: Rows, ahead: int, index_size: int) -> Iterator[tuple[bytes, tuple[Device, bytes]]]:
+    for at in range(rows.size - ahead):
+        suffix, shown, device = rows.suffix(at), rows.suffix(at + ahead), rows.device(at + ahead)
+        if device is not None and len(suffix) == len(shown) == index_size:
+            yield suffix + _NULL, (device, shown)

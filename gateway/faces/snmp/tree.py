@@ -20,7 +20,7 @@ from itertools import accumulate
 from gateway.core.site import Device
 from gateway.faces.snmp import reader
 from gateway.faces.snmp.client_tail import ClientTail
-from gateway.faces.snmp.columns import Cell, Column, Rows, column_of
+from gateway.faces.snmp.columns import Cell, Column, column_of
 from gateway.faces.snmp.entity import entities
 from gateway.faces.snmp.layout import Layout
 from gateway.faces.snmp.log_table import LogDays, LogTail
@@ -37,6 +37,7 @@ from gateway.faces.snmp.objects import (
     Table,
 )
 from gateway.faces.snmp.routes import Routes
+from gateway.faces.snmp.rows import ARC_BITS, NumberedRows, Rows
 from gateway.faces.snmp.settings import Oid, View
 from gateway.faces.snmp.tails import Tail, Tails
 
@@ -124,7 +125,7 @@ class Window:
         depth = len(base)
         if oid[:depth] != base:
             return self.starts[number + 1]
-        return self.starts[number] + bisect_right(self.columns[number].rows.indexes, oid[depth:])
+        return self.starts[number] + self.columns[number].rows.behind(oid[depth:])
 
     def locate(self, place: int) -> tuple[int, int]:
         """Number of the column, and position in it, of a place before the end."""
@@ -190,7 +191,7 @@ class Tree(Window):
         made: dict[RowKind, Rows] = {}
         for table in tables:
             if table.rows not in made:
-                made[table.rows] = Rows(_ROWS[table.rows](gateway))
+                made[table.rows] = _ROWS[table.rows](gateway)
             columns += _columns(table, made[table.rows])
         columns.sort(key=lambda column: column.base)
         objects = frozenset((*group.base, each.number) for group in groups for each in group.objects) | frozenset(
@@ -216,7 +217,7 @@ def _columns(table: Table, rows: Rows) -> Iterator[Column]:
     for described in table.columns:
         key = described.models, described.only
         if key not in chosen:
-            having = [at for at, row in enumerate(rows.rows) if _has(described, row)]
+            having = [at for at in range(rows.size) if _has(described, rows.row(at))]
             chosen[key] = rows if len(having) == rows.size else rows.only(having)
         if chosen[key].size:
             yield column_of((*table.base, 1, described.number), described, chosen[key])
@@ -254,33 +255,31 @@ def whole(
     return Tree(gateway, (*groups, *layout.groups), (*tables, *own), tails=Tails(tails))
 
 
-Found = list[tuple[Oid, Row]]
-"""Rows with the arcs of their index."""
-
-
-def _conditions(gateway: Gateway) -> Found:
+def _conditions(gateway: Gateway) -> Rows:
     conditions = gateway.conditions
     if conditions is None:
-        return []
-    return [
-        ((watch.unit_id, watch.condition.code), ConditionRow(gateway, watch, conditions.devices.get(watch.unit_id)))
-        for watch in conditions
-    ]
+        return Rows(())
+
+    def row(unit: int, code: int) -> ConditionRow:
+        of = conditions.devices[unit] if unit else None
+        watches = conditions.gateway if of is None else of
+        return ConditionRow(gateway, watches[code], of)
+
+    numbers = (watch.unit_id << ARC_BITS | watch.condition.code for watch in conditions)
+    return NumberedRows(numbers, 1 << ARC_BITS, row, lambda _unit: None)
 
 
-_ROWS: Mapping[RowKind, Callable[[Gateway], Found]] = {
-    RowKind.LINE: lambda gateway: [((line.index,), LineRow(gateway, line)) for line in gateway.site.lines],
-    RowKind.DEVICE: lambda gateway: [((each.unit_id,), DeviceRow(gateway, each)) for each in gateway.site.devices],
+_ROWS: Mapping[RowKind, Callable[[Gateway], Rows]] = {
+    RowKind.LINE: lambda gateway: Rows(((line.index,), LineRow(gateway, line)) for line in gateway.site.lines),
+    RowKind.DEVICE: lambda gateway: Rows(((each.unit_id,), DeviceRow(gateway, each)) for each in gateway.site.devices),
     RowKind.CONDITION: _conditions,
-    RowKind.CLIENT: lambda _gateway: [],  # see client_tail.py
-    RowKind.LOG: lambda _gateway: [],  # see log_table.py
-    RowKind.CAPABILITY: lambda gateway: [
+    RowKind.CLIENT: lambda _gateway: Rows(()),  # see client_tail.py
+    RowKind.LOG: lambda _gateway: Rows(()),  # see log_table.py
+    RowKind.CAPABILITY: lambda gateway: Rows(
         ((at + 1,), CapabilityRow(gateway, at)) for at in range(len(gateway.capabilities))
-    ],
-    RowKind.ENTITY: lambda gateway: [((entity.index,), entity) for entity in entities(gateway)],
-    RowKind.SENSOR: lambda gateway: [
-        ((entity.index,), entity) for entity in entities(gateway) if entity.point is not None
-    ],
+    ),
+    RowKind.ENTITY: entities,
+    RowKind.SENSOR: lambda gateway: entities(gateway, sensors_only=True),
 }
 """The rows that a table of this kind will ever have."""
 

@@ -34,20 +34,21 @@ RESPONSE = 0xA2
 REPORT = 0xA8
 
 
-_SHORT = [[bytes((tag, size)) for size in range(0x80)] for tag in range(0x100)]
-"""Identifier and short length, ready made."""
+_USED = (0x02, 0x04, 0x06, 0x30, 0x41, 0x42, 0x43, RESPONSE, REPORT)
+_SHORT = {tag: [bytes((tag, size)) for size in range(0x80)] for tag in _USED}
+"""Identifier and short length, ready made for what is written often."""
 
 
 def tlv(tag: int, content: bytes) -> bytes:
     """One value with its identifier and definite length."""
     size = len(content)
-    return _SHORT[tag][size] + content if size < 0x80 else head(tag, size) + content
+    return _SHORT[tag][size] + content if size < 0x80 and tag in _SHORT else head(tag, size) + content
 
 
 def head(tag: int, size: int) -> bytes:
     """What stands before a content of so many octets."""
     if size < 0x80:
-        return _SHORT[tag][size]
+        return _SHORT[tag][size] if tag in _SHORT else bytes((tag, size))
     length = size.to_bytes((size.bit_length() + 7) // 8, "big")
     return bytes((tag, 0x80 | len(length))) + length
 
@@ -93,6 +94,18 @@ def tagged(tag: int, cell: CellValue, *, wraps: bool) -> bytes:
 def varbind(name: bytes, content: bytes) -> bytes:
     """A VarBind of an encoded name and an encoded value."""
     return tlv(0x30, name + content)
+
+
+def cell(name: bytes, content: bytes) -> bytes:
+    """A VarBind of the octets of a name and an encoded value: the same as `varbind(tlv(0x06, name), content)`."""
+    size = len(name)
+    whole = size + len(content) + 2
+    if whole >= 0x80:
+        return varbind(tlv(0x06, name), content)
+    return _VARBINDS[whole] + _NAMES[size] + name + content
+
+
+_VARBINDS, _NAMES = _SHORT[0x30], _SHORT[0x06]
 
 
 def counter(oid: Oid, count: int) -> bytes:

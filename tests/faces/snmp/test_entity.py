@@ -15,7 +15,7 @@ from gateway.devices.schema import load_map, models
 from gateway.errors import MapError
 from gateway.faces.snmp import entity
 from gateway.faces.snmp.agent import SnmpAgent
-from gateway.faces.snmp.objects import Gateway
+from gateway.faces.snmp.objects import EntityRow, Gateway
 from gateway.faces.snmp.settings import Oid
 from tests.faces.snmp import librenms
 from tests.faces.snmp.stub_site import NOW, Ask, StubClock, online, stale
@@ -177,7 +177,10 @@ def test_another_device_moves_no_index(agent: SnmpAgent, site: Site, device_map:
     gateway = next(slot for slot in agent.tree).row
     assert isinstance(gateway, Gateway)
     more = replace(gateway, site=Site.of("more", site.lines, [*site.devices, added]))
-    before, after = ({row.index: row for row in entity.entities(each)} for each in (gateway, more))
+    before, after = (
+        {row.number: row for row in map(rows.row, range(rows.size)) if isinstance(row, EntityRow)}
+        for rows in map(entity.entities, (gateway, more))
+    )
     assert {index: (row.device, row.point) for index, row in after.items() if row.device is not added} == {
         index: (row.device, row.point) for index, row in before.items()
     }
