@@ -15,6 +15,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from tests.cable import Cable
+from tests.ports import free_port
 
 # Deadlines measure the machine, not the code. CI replays the same examples on every run, so that a red
 # build means a changed product; a developer's run explores new ones.
@@ -56,20 +57,13 @@ def cable(peer: Callable[[str], str]) -> Iterator[Cable]:
     made.remove()
 
 
-def _free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
 @pytest.fixture
 def free_tcp_port() -> Callable[[], int]:
     """A TCP port of 127.0.0.1 that was free a moment ago, for programs that cannot be given port 0."""
-    return lambda: _free_port(socket.SOCK_STREAM)
+    return lambda: free_port(socket.SOCK_STREAM)
 
 
 @pytest.fixture
 def free_udp_port() -> Callable[[], int]:
     """A UDP port of 127.0.0.1 that was free a moment ago, for programs that cannot be given port 0."""
-    return lambda: _free_port(socket.SOCK_DGRAM)
+    return lambda: free_port(socket.SOCK_DGRAM)

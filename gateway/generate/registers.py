@@ -124,19 +124,7 @@ def _points(device_map: DeviceMap, extent: Extent) -> str:
         if run.space is extent.space and extent.first <= run.first <= extent.last:
             reserved = (_range(run.first, run.last), "*reserved*", "", "", "", "", "", "", "", _sentence(run.doc))
             rows.append((run.first, reserved))
-    headings = (
-        "Address",
-        "Point",
-        "In the document",
-        "Unit",
-        "Codec",
-        "Access",
-        "Poll",
-        "MIB object",
-        "Metric",
-        "What",
-    )
-    return table(headings, (row for _, row in sorted(rows)))
+    return table(_POINT_HEADINGS, (row for _, row in sorted(rows)))
 
 
 def _lies_in(point: Point, extent: Extent) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from random import Random
-from typing import Any
+from typing import Any, Protocol
 
 from gateway.core.engine import LineEngine
 from gateway.core.identity import Identity
@@ -14,6 +14,25 @@ from gateway.core.settings import LineSettings
 from gateway.core.site import Device, Outcome
 from gateway.devices.schema import load_map
 from gateway.simulator.line import SimulatedLine, Station
+
+
+class Timed(Protocol):
+    """Something that lives in virtual time."""
+
+    now: float
+
+    def run(self, seconds: float) -> None:
+        """Let `seconds` pass."""
+        ...
+
+
+def end_of(outcomes: list[Outcome], line: Timed, wait_s: float) -> Outcome:
+    """The one outcome that a request has, within `wait_s`."""
+    until = line.now + wait_s
+    while not outcomes and line.now < until:
+        line.run(0.01)
+    assert len(outcomes) == 1, "every request ends, once"
+    return outcomes[0]
 
 
 class VirtualLine:
@@ -59,11 +78,7 @@ class VirtualLine:
         """Read as a client does and wait for the outcome."""
         outcomes: list[Outcome] = []
         self.read(device, pdu, outcomes.append)
-        end = self.now + wait_s
-        while not outcomes and self.now < end:
-            self.run(0.01)
-        assert len(outcomes) == 1, "every read ends, once"
-        return outcomes[0]
+        return end_of(outcomes, self, wait_s)
 
 
 def make_line(

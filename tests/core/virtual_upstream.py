@@ -14,6 +14,7 @@ from gateway.core.site import Device, Outcome
 from gateway.core.upstream import UpstreamEngine
 from gateway.modbus.mbap import Adu, MbapSplitter
 from gateway.simulator.upstream import ServerConnection, SimulatedServer
+from tests.core.virtual_line import end_of
 
 RECONNECT_S = 0.002
 FEWER_S = 1.0
@@ -70,13 +71,13 @@ class VirtualUpstream:
         """Read and wait for the outcome."""
         outcomes: list[Outcome] = []
         self.read(device, pdu, outcomes.append)
-        return self._await(outcomes, wait_s)
+        return end_of(outcomes, self, wait_s)
 
     def write(self, device: int, pdu: bytes, wait_s: float = 30.0) -> Outcome:
         """Write and wait for the outcome."""
         outcomes: list[Outcome] = []
         self.engine.write(self.devices[device], pdu, outcomes.append, self.now, client="")
-        return self._await(outcomes, wait_s)
+        return end_of(outcomes, self, wait_s)
 
     def reset(self) -> None:
         """The connections break now."""
@@ -86,13 +87,6 @@ class VirtualUpstream:
     def units_asked(self) -> Counter[int]:
         """How many requests went out to each unit."""
         return Counter(adu.unit for _, adu in self.sent)
-
-    def _await(self, outcomes: list[Outcome], wait_s: float) -> Outcome:
-        end = self.now + wait_s
-        while not outcomes and self.now < end:
-            self.run(0.01)
-        assert len(outcomes) == 1, "every request ends, once"
-        return outcomes[0]
 
     def _connect(self) -> None:
         if self._connections or self.now < self._connect_at:

@@ -20,6 +20,7 @@ import pytest
 from tests.deploy.promtool import REPOSITORY, RULES
 from tests.e2e.conftest import start
 from tests.e2e.programs import GATEWAY, MIXED_DEVICES, Program, wait_until, write_config
+from tests.ports import free_port
 
 __all__ = ["start"]
 
@@ -67,8 +68,8 @@ def read_past_the_polls(port: int) -> None:
 def server(peer: Callable[[str], str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     """A Prometheus with the delivered configuration (scrapes twice a second) and some seconds of a site."""
     program, folder = peer("prometheus"), tmp_path_factory.mktemp("site")
-    gateway = [_free(socket.SOCK_STREAM), _free(socket.SOCK_DGRAM), _free(socket.SOCK_STREAM)]
-    port = _free(socket.SOCK_STREAM)
+    gateway = [free_port(socket.SOCK_STREAM), free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)]
+    port = free_port(socket.SOCK_STREAM)
     config = (REPOSITORY / "deploy" / "prometheus" / "prometheus.yml").read_text(encoding="utf-8")
     (folder / "rules").mkdir()
     for rules in RULES:
@@ -112,13 +113,6 @@ def server(peer: Callable[[str], str], tmp_path_factory: pytest.TempPathFactory)
         finally:
             for each in reversed(started):
                 each.end()
-
-
-def _free(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 @pytest.fixture(scope="session")

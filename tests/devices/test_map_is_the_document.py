@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Callable
 
@@ -11,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.devices.decode import Decoder
-from gateway.devices.model import Access, DeviceMap, Group, Point, PollClass, Space, WordOrder
+from gateway.devices.model import Access, DeviceMap, Group, PollClass, Space, WordOrder
 from gateway.devices.schema import load_map
+from tests.devices.document import check_values, points_at, reserved_at
 
 # address, variable, unit, kind. HI and LO name the half of a 32-bit pair that the address holds.
 RAM = """
@@ -245,30 +245,18 @@ def prostar() -> DeviceMap:
     return load_map("prostar-mppt")
 
 
-def _points_at(device_map: DeviceMap, space: Space, address: int) -> list[Point]:
-    return [
-        point
-        for point in device_map.points
-        if point.space is space and point.address <= address < point.address + point.words
-    ]
-
-
-def _reserved_at(device_map: DeviceMap, space: Space, address: int) -> int:
-    return sum(run.space is space and run.first <= address <= run.last for run in device_map.reserved)
-
-
 def test_list_has_every_address_once() -> None:
     assert [address for address, _ in ROWS] == [*range(0x52), *range(0xE000, 0xE050)]
 
 
 @pytest.mark.parametrize(("address", "row"), [pytest.param(*row, id=f"{row[0]:04X}-{row[1][0]}") for row in ROWS])
 def test_register_is_in_the_map_as_in_the_document(prostar: DeviceMap, address: int, row: list[str]) -> None:
-    found = _points_at(prostar, Space.REGISTERS, address)
+    found = points_at(prostar, Space.REGISTERS, address)
     if row == ["RESERVED"]:
         assert not found
-        assert _reserved_at(prostar, Space.REGISTERS, address) == 1
+        assert reserved_at(prostar, Space.REGISTERS, address) == 1
         return
-    assert _reserved_at(prostar, Space.REGISTERS, address) == 0
+    assert reserved_at(prostar, Space.REGISTERS, address) == 0
     (point,) = found
     symbol, unit, *kind = row
     assert point.symbol == symbol
@@ -298,25 +286,15 @@ def test_any_block_reads_as_the_document_says(first: int, count: int, data: st.D
     prostar = load_map("prostar-mppt")
     words = tuple(data.draw(st.lists(st.integers(0, 0xFFFF), min_size=count, max_size=count)))
     values = Decoder(prostar).decode(Space.REGISTERS, first, struct.pack(f">{count}H", *words))
-    for point in prostar.points:
-        if point.space is not Space.REGISTERS or not first <= point.address < first + count:
-            continue
-        expected = _expected(first, words).get(point.symbol)
-        if expected is not None and point.plausible is not None:
-            low, high = point.plausible
-            expected = expected if low <= expected <= high else None
-        if expected is None:
-            assert point.name not in values
-        else:
-            assert math.isclose(values[point.name], expected, rel_tol=1e-12), point.name
+    check_values(prostar, first, count, values, _expected(first, words))
 
 
 def test_every_coil_is_a_point_or_reserved(prostar: DeviceMap) -> None:
     for address in range(0x100):
-        found = _points_at(prostar, Space.COILS, address)
+        found = points_at(prostar, Space.COILS, address)
         symbol = (STATE_COILS | COMMAND_COILS).get(address)
         assert [point.symbol for point in found] == ([] if symbol is None else [symbol])
-        assert _reserved_at(prostar, Space.COILS, address) == (symbol is None)
+        assert reserved_at(prostar, Space.COILS, address) == (symbol is None)
         assert [point.group for point in found] == (
             [Group.LIVE] if address in STATE_COILS else [Group.COMMAND] if symbol else []
         )
@@ -470,4 +448,4 @@ def test_what_the_field_disagrees_about_has_another_reading(prostar: DeviceMap) 
     assert others[0xE027] == {"seconds"}
     for address in range(0xE040, 0xE04A, 2):
         assert others[address] == {"hi_lo"}
-        assert _points_at(prostar, Space.REGISTERS, address)[0].confidence == "low"
+        assert points_at(prostar, Space.REGISTERS, address)[0].confidence == "low"

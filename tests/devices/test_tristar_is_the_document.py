@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Callable, Iterator
 
@@ -11,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.devices.decode import Decoder
-from gateway.devices.model import Access, DeviceMap, Group, Kind, Point, PollClass, Released, Space, WordOrder
+from gateway.devices.model import Access, DeviceMap, Group, Kind, PollClass, Released, Space, WordOrder
 from gateway.devices.plan import poll_plan
 from gateway.devices.schema import load_map
+from tests.devices.document import check_values, points_at, reserved_at
 
 # address, variable, unit, kind. HI and LO name the half of a 32-bit pair that the address holds.
 # V15: n·V_PU·2^-15 and so on, A the current, W both; a number and @15: n·number·2^-15; signed unless it says u.
@@ -237,18 +237,6 @@ def tristar() -> DeviceMap:
     return load_map("tristar-mppt")
 
 
-def _points_at(device_map: DeviceMap, space: Space, address: int) -> list[Point]:
-    return [
-        point
-        for point in device_map.points
-        if point.space is space and point.address <= address < point.address + point.words
-    ]
-
-
-def _reserved_at(device_map: DeviceMap, space: Space, address: int) -> int:
-    return sum(run.space is space and run.first <= address <= run.last for run in device_map.reserved)
-
-
 def test_list_has_every_address_once() -> None:
     assert [address for address, _ in ROWS] == [
         *range(0x5C),
@@ -260,12 +248,12 @@ def test_list_has_every_address_once() -> None:
 
 @pytest.mark.parametrize(("address", "row"), [pytest.param(*row, id=f"{row[0]:04X}-{row[1][0]}") for row in ROWS])
 def test_register_is_in_the_map_as_in_the_document(tristar: DeviceMap, address: int, row: list[str]) -> None:
-    found = _points_at(tristar, Space.REGISTERS, address)
+    found = points_at(tristar, Space.REGISTERS, address)
     if row == ["RESERVED"]:
         assert not found
-        assert _reserved_at(tristar, Space.REGISTERS, address) == 1
+        assert reserved_at(tristar, Space.REGISTERS, address) == 1
         return
-    assert _reserved_at(tristar, Space.REGISTERS, address) == 0
+    assert reserved_at(tristar, Space.REGISTERS, address) == 0
     (point,) = found
     symbol, unit, *kind = row
     assert point.symbol.replace(" ", "_") == symbol
@@ -300,18 +288,7 @@ def test_any_block_reads_as_the_document_says(first: int, count: int, data: st.D
         words = (123, 0xE000, 80, 0x8000, *words[4:])
     known = {"voltage_scaling": V_PU, "current_scaling": I_PU}
     values = Decoder(tristar).decode(Space.REGISTERS, first, struct.pack(f">{count}H", *words), known=known)
-    expected_of = _expected(first, words)
-    for point in tristar.points:
-        if point.space is not Space.REGISTERS or not first <= point.address < first + count:
-            continue
-        expected = expected_of.get(point.symbol.replace(" ", "_"))
-        if expected is not None and point.plausible is not None:
-            low, high = point.plausible
-            expected = expected if low <= expected <= high else None
-        if expected is None:
-            assert point.name not in values
-        else:
-            assert math.isclose(values[point.name], expected, rel_tol=1e-12), point.name
+    check_values(tristar, first, count, values, _expected(first, words))
 
 
 # ---- The worked examples of the document
@@ -380,10 +357,10 @@ def test_addresses_and_names_of_the_network(tristar: DeviceMap) -> None:
 
 def test_every_coil_is_a_point_or_reserved(tristar: DeviceMap) -> None:
     for address in (*range(0x100), *range(0x1000, 0x1004), 0x10FF):
-        found = _points_at(tristar, Space.COILS, address)
+        found = points_at(tristar, Space.COILS, address)
         symbol = (STATE_COILS | COMMAND_COILS).get(address)
         assert [point.symbol for point in found] == ([] if symbol is None else [symbol])
-        assert _reserved_at(tristar, Space.COILS, address) == (symbol is None)
+        assert reserved_at(tristar, Space.COILS, address) == (symbol is None)
         groups = [Group.LIVE] if address in STATE_COILS else [Group.COMMAND] if symbol else []
         assert [point.group for point in found] == groups
 

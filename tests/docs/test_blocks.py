@@ -23,6 +23,7 @@ from gateway.service.config import load_config
 from tests.docs.blocks import ROOT, Block, blocks
 from tests.e2e.fast_lines import BAUDRATE
 from tests.e2e.programs import DEMO_DEVICES, GATEWAY, Program, Running, wait_until, write_config
+from tests.ports import free_port
 
 ALL = list(blocks())
 SHELL = [block for block in ALL if block.kind in {"", "sh"}]
@@ -55,7 +56,7 @@ def ids(block: Block) -> str:
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     """The demo's controllers and a gateway that has read a year of days from one of them."""
     folder = tmp_path_factory.mktemp("docs")
-    ports = (_free(socket.SOCK_STREAM), _free(socket.SOCK_DGRAM), _free(socket.SOCK_STREAM))
+    ports = (free_port(socket.SOCK_STREAM), free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM))
     programs = []
     try:
         programs.append(Program((sys.executable, "-m", "tests.e2e.fast_lines", str(folder), "plants")))
@@ -69,13 +70,6 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     finally:
         for each in reversed(programs):
             each.end()
-
-
-def _free(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def test_every_kind_of_block_has_somebody_who_runs_it() -> None:

@@ -28,6 +28,8 @@ from gateway.simulator.chaos import Chaos, Fault
 from gateway.simulator.line import SimulatedLine
 from gateway.simulator.medium import Medium
 from gateway.simulator.oracle import OracleController, Verdict
+from tests.core.virtual_line import end_of
+from tests.faults.judge import Judge
 
 QUIET = PollSettings(live_s=3600.0, settings_s=3600.0)
 """Polls only at the start, so that a test has the line to itself."""
@@ -91,8 +93,7 @@ class Rig:
         self.verdicts: Counter[Verdict] = Counter()
         self.outcomes: Counter[str] = Counter()
         self._wrong: AssertionError | None = None  # the first; raised by `run`, for the engine survives its callers
-        self._versions = [0] * len(self.units)
-        self._judged: dict[tuple[int, str, int, int], float] = {}
+        self._judge_of = Judge(self.units, self.devices, self._count)
         self._reopen_at = math.inf
         if isinstance(medium, Chaos):
             medium.on_port_fault = self._port_fault
@@ -117,7 +118,7 @@ class Rig:
             if data:
                 engine.receive(data, self.now)
             engine.on_timer(self.now)
-            self._judge_snapshots()
+            self._judge_of.blocks()
             self._raise_wrong()
             if self._reopen_at <= self.now:
                 self._reopen_at = math.inf
@@ -147,20 +148,13 @@ class Rig:
         """Read and wait for the outcome."""
         outcomes: list[Outcome] = []
         self.read(unit, pdu, outcomes.append)
-        return self._await(outcomes, wait_s)
+        return end_of(outcomes, self, wait_s)
 
     def write(self, unit: int, pdu: bytes, wait_s: float = 30.0) -> Outcome:
         """Write and wait for the outcome."""
         outcomes: list[Outcome] = []
         self.engine.write(self.devices[unit], pdu, outcomes.append, self.now, client="")
-        return self._await(outcomes, wait_s)
-
-    def _await(self, outcomes: list[Outcome], wait_s: float) -> Outcome:
-        end = self.now + wait_s
-        while not outcomes and self.now < end:
-            self.run(0.01)
-        assert len(outcomes) == 1, "every request ends, once"
-        return outcomes[0]
+        return end_of(outcomes, self, wait_s)
 
     def state(self, unit: int = 0) -> DeviceState:
         """The device's state."""
@@ -178,12 +172,7 @@ class Rig:
 
     def judge_values(self) -> None:
         """Decoded values that a face would show now."""
-        for unit, device in zip(self.units, self.devices, strict=True):
-            snapshot = device.snapshot
-            points = {point.name: point for point in device.map.points}
-            for name, value in snapshot.shown().items():
-                verdict = unit.judge_value(points[name], value, read_at=snapshot.read_at[name])
-                self._count(verdict, f"value {name}={value!r} of {device.name}")
+        self._judge_of.values()
 
     def _raise_wrong(self) -> None:
         if self._wrong is not None:
@@ -199,22 +188,6 @@ class Rig:
             return
         verdict = unit.judge_reply(pdu, outcome, asked_at=asked_at)
         self._count(verdict, f"reply {outcome.hex()} to {pdu.hex()} of unit {unit.address}, asked at {asked_at:.4f}")
-
-    def _judge_snapshots(self) -> None:
-        for index, device in enumerate(self.devices):
-            snapshot = device.snapshot
-            if snapshot.version == self._versions[index]:
-                continue
-            self._versions[index] = snapshot.version
-            for block in snapshot.blocks:
-                key = (index, block.space.value, block.first, block.count)
-                if self._judged.get(key) == block.read_at:
-                    continue
-                self._judged[key] = block.read_at
-                verdict = self.units[index].judge(
-                    block.space, block.first, block.count, block.data, asked_at=block.read_at
-                )
-                self._count(verdict, f"block {block} of {device.name}")
 
     def _count(self, verdict: Verdict, what: str) -> None:
         self.verdicts[verdict] += 1

@@ -6,17 +6,21 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from typing import TypeVar
 
 from gateway.clock import SystemClock
 from gateway.core.settings import LineSettings
 from gateway.core.site import Device, Outcome
 from gateway.lines.serial import SerialLine
+from gateway.lines.upstream import UpstreamLine
 from gateway.modbus.pdu import Function, ReadRequest
 from tests.machine import Stopwatch
 
+Line = TypeVar("Line", SerialLine, UpstreamLine)
+
 
 @contextlib.asynccontextmanager
-async def running(line: SerialLine) -> AsyncIterator[SerialLine]:
+async def running(line: Line) -> AsyncIterator[Line]:
     task = asyncio.create_task(line.run())
     try:
         yield line
@@ -38,7 +42,7 @@ async def until(condition: Callable[[], bool], limit_s: float = 30.0) -> None:
             await asyncio.sleep(0.01)
 
 
-async def ask(line: SerialLine, device: Device, address: int, count: int = 1) -> Outcome:
+async def ask(line: SerialLine | UpstreamLine, device: Device, address: int, count: int = 1) -> Outcome:
     done: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
     line.read(device, ReadRequest(Function.READ_HOLDING_REGISTERS, address, count).encode(), done.set_result)
     async with asyncio.timeout(30):

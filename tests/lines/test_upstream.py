@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import socket
 import time
-from collections.abc import AsyncIterator
 from typing import Any
 
 import pytest
 
 from gateway.clock import SystemClock
 from gateway.core.settings import LineSettings, PollSettings, UpstreamSettings
-from gateway.core.site import Device, LineState, Outcome
+from gateway.core.site import Device, LineState
 from gateway.core.snapshot import DeviceState
 from gateway.devices.schema import load_map
 from gateway.errors import LineDown
 from gateway.lines.upstream import UpstreamLine
-from gateway.modbus.pdu import Function, ReadRequest
 from gateway.simulator.oracle import OracleController
 from gateway.simulator.tcp import TcpServer
 from gateway.simulator.upstream import Habits, SimulatedServer
 from tests.faults.rig import oracle_map
-from tests.lines.rig import lag_meter, until
+from tests.lines.rig import ask, lag_meter, running, until
 from tests.machine import Stopwatch
 
 FAST = PollSettings(live_s=0.2, settings_s=60.0)
@@ -49,24 +46,6 @@ def line_to(host: str, port: int, units: list[Device], **settings: Any) -> Upstr
     settings = {"poll": FAST, "reply_timeout_s": 0.3, **settings}
     where = f"tcp://{host}:{port}"
     return UpstreamLine(LineSettings("site-a", 1, where, upstream=upstream, **settings), units, SystemClock())
-
-
-@contextlib.asynccontextmanager
-async def running(line: UpstreamLine) -> AsyncIterator[UpstreamLine]:
-    task = asyncio.create_task(line.run())
-    try:
-        yield line
-    finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-
-async def ask(line: UpstreamLine, device: Device, first: int = 0, count: int = 10) -> Outcome:
-    done: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
-    line.read(device, ReadRequest(Function.READ_HOLDING_REGISTERS, first, count).encode(), done.set_result)
-    async with asyncio.timeout(30):
-        return await done
 
 
 def state(line: UpstreamLine) -> LineState:
@@ -103,7 +82,7 @@ async def online_once(habits: Habits) -> None:
     async with server, running(line_to("127.0.0.1", server.port, units)) as line:
         await until(lambda: all_online(units))
         for k in range(10):
-            assert isinstance(await ask(line, units[k % 2]), bytes)
+            assert isinstance(await ask(line, units[k % 2], 0, 10), bytes)
 
 
 async def test_a_server_that_closes_after_every_reply_gives_no_error_and_no_pause() -> None:
@@ -113,7 +92,7 @@ async def test_a_server_that_closes_after_every_reply_gives_no_error_and_no_paus
         await until(lambda: all_online(units))
         watch = Stopwatch()
         for k in range(30):
-            assert isinstance(await ask(line, units[k % 2]), bytes)
+            assert isinstance(await ask(line, units[k % 2], 0, 10), bytes)
         assert watch.s < 3.0
         assert set(line.stats.failed) <= {"exception"}, "its habit is learnt without losing a request"
         assert line.stats.upstream is not None
@@ -147,7 +126,7 @@ async def test_a_further_connection_that_is_not_to_be_had_is_done_without() -> N
         async with running(line):
             await until(lambda: all_online(units))
             for _ in range(20):
-                replies = await asyncio.gather(*(ask(line, units[k % 2], 10 * k) for k in range(6)))
+                replies = await asyncio.gather(*(ask(line, units[k % 2], 10 * k, 10) for k in range(6)))
                 assert all(isinstance(reply, bytes) for reply in replies)
             assert line.stats.opens == 1
             assert line.stats.upstream is not None
@@ -165,7 +144,7 @@ async def test_a_refused_connection_takes_the_line_down_and_it_recovers_alone(
         server.close()
         await until(lambda: state(line) is LineState.DOWN)
         assert units[0].snapshot.state is DeviceState.STALE
-        assert isinstance(await ask(line, units[0]), LineDown)
+        assert isinstance(await ask(line, units[0], 0, 10), LineDown)
         assert "connection refused" in line.status(0.0).error
         await server.open()
         await until(lambda: all_online(units))
@@ -182,7 +161,7 @@ async def test_a_cut_connection_is_followed_by_the_next_and_nobody_notices() -> 
         await until(lambda: all_online(units))
         for _ in range(5):
             server.cut()
-            assert isinstance(await ask(line, units[0]), bytes)
+            assert isinstance(await ask(line, units[0], 0, 10), bytes)
         assert line.stats.opens == 1
         assert all_online(units)
 

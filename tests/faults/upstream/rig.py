@@ -21,6 +21,7 @@ from gateway.simulator.oracle import Verdict
 from gateway.simulator.tcp_chaos import EXCEPTIONS, TcpChaos
 from gateway.simulator.upstream import Habits, SimulatedServer
 from tests.core.virtual_upstream import VirtualUpstream, make_upstream
+from tests.faults.judge import Judge
 from tests.faults.rig import Unit, oracle_map, read
 
 POLL = PollSettings(live_s=1.0, settings_s=10.0)
@@ -40,12 +41,12 @@ class UpstreamRig:
         settings.setdefault("poll", POLL)
         self.connections: int = settings.get("connections", 1)
         self.line: VirtualUpstream = make_upstream(self.server, devices, **settings)
-        self.line.after_step = self._judge_snapshots
+        judge = Judge(self.units, devices, self._count)
+        self.line.after_step = judge.blocks
+        self._judge_values = judge.values
         self.devices = devices
         self.verdicts: Counter[Verdict] = Counter()
         self.outcomes: Counter[str] = Counter()
-        self._versions = [0] * len(units)
-        self._judged: dict[tuple[int, str, int, int], float] = {}
 
     def read(self, unit: int, pdu: bytes, client: str = "", done: Callable[[Outcome], None] | None = None) -> None:
         """Read as a client does; the outcome is judged."""
@@ -74,26 +75,7 @@ class UpstreamRig:
         assert 0 <= stats.sent - stats.ok - stats.failed.total() <= 8 * self.connections, stats
         assert set(stats.failed) <= {"timeout", "mismatch", "exception", "connection_lost", "line_down"}, stats.failed
         assert self.server.counters.most_open <= self.connections
-        for unit, device in zip(self.units, self.devices, strict=True):
-            points = {point.name: point for point in device.map.points}
-            for name, value in device.snapshot.shown().items():
-                verdict = unit.judge_value(points[name], value, read_at=device.snapshot.read_at[name])
-                self._count(verdict, f"value {name}={value!r} of {device.name}")
-
-    def _judge_snapshots(self) -> None:
-        for index, device in enumerate(self.devices):
-            snapshot = device.snapshot
-            if snapshot.version == self._versions[index]:
-                continue
-            self._versions[index] = snapshot.version
-            for block in snapshot.blocks:
-                key = (index, block.space.value, block.first, block.count)
-                if self._judged.get(key) == block.read_at:
-                    continue
-                self._judged[key] = block.read_at
-                unit = self.units[index]
-                verdict = unit.judge(block.space, block.first, block.count, block.data, asked_at=block.read_at)
-                self._count(verdict, f"block {block} of {device.name}")
+        self._judge_values()
 
     def _count(self, verdict: Verdict, what: str) -> None:
         self.verdicts[verdict] += 1
