@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -15,6 +16,7 @@ from gateway.cli.config_file import ConfigOption, load_or_exit, refuse
 from gateway.clock import SystemClock
 from gateway.core.budget import LineBudget
 from gateway.service.advice import advice
+from gateway.service.changes import NEEDS_RESTART, changes
 from gateway.service.config import Config
 from gateway.service.settings import line_budgets, line_settings
 from gateway.service.snmp import snmp_on, unreadable
@@ -26,12 +28,18 @@ def command(
     quiet: Annotated[
         bool, typer.Option("--quiet", help="Print problems only; secrets that cannot be read here are some.")
     ] = False,
+    against: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The file in use: print what a reload would change.")
+    ] = None,
 ) -> None:
     """Check a configuration: exit status 0 and a projection of its lines, or 78 and every problem."""
     checked = load_or_exit(config)
     problems = [*tls_problems(checked, SystemClock().wall()), *(unreadable(checked) if quiet else ())]
     if problems:
         refuse(config, [f"{config}: {problem}" for problem in problems])
+    if against is not None:
+        _compare(load_or_exit(against), checked)
+        return
     if quiet:
         return
     budgets = line_budgets(checked)
@@ -46,6 +54,15 @@ def command(
     for text in advice(checked, budgets):
         console.print(f"[yellow]warning[/] {escape(text)}", soft_wrap=True)
     console.print(f"[green]{escape(str(config))} is right.[/]", soft_wrap=True)
+
+
+def _compare(before: Config, after: Config) -> None:
+    """The keys that differ, by path; their values may be secret."""
+    keys = changes(before, after)
+    for key in keys:
+        print(f"{key}: needs a restart; a reload keeps the old one" if key in NEEDS_RESTART else key)
+    if not keys:
+        print("A reload would read certificates and secrets again, and change nothing else.")
 
 
 def _emc1(config: Config) -> str:

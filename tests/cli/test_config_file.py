@@ -93,3 +93,23 @@ def test_quiet_says_nothing_of_a_file_that_is_right_and_names_secrets_that_canno
     status, shown, said = run("check-config", "--quiet", "-c", str(config))
     assert (status, shown, said.count(str(missing))) == (78, "", 2)
     assert run("check-config", "-c", str(config))[0] == 0  # whoever writes a file need not be who may read its secrets
+
+
+def test_what_a_reload_would_change_is_told_by_key(config: Path) -> None:
+    right = config.read_text().replace(WRONG_ELSEWHERE, "address = 1\n")
+    config.write_text(right)
+    other = config.with_name("site.new")
+    other.write_text(right + '[http]\nlisten = []\n[[snmp.community]]\nname = "a-secret"\nsource = ["::1"]\n')
+    status, shown, said = run("check-config", "-c", str(other), "--against", str(config))
+    assert (status, shown.split(), said) == (0, ["snmp.community[0]", "http.listen"], "")
+    other.write_text(right.replace("/state", "/elsewhere").replace("address = 1\n", "address = 2\n"))
+    status, shown, said = run("check-config", "-c", str(other), "--against", str(config))
+    assert (status, said) == (0, "")
+    assert shown.splitlines() == [
+        "state_dir: needs a restart; a reload keeps the old one",
+        "line[shelter-a].device[array-1].address",
+    ]
+    assert run("check-config", "-c", str(config), "--against", str(config))[1].endswith("change nothing else.\n")
+    other.write_text("site = 1\n")
+    assert run("check-config", "-c", str(other), "--against", str(config))[0] == 78
+    assert run("check-config", "-c", str(config), "--against", str(other))[0] == 78
