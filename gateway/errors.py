@@ -257,3 +257,9 @@ class ConfigError(GatewayError):
     def __init__(self, problems: tuple[str, ...]) -> None:
         super().__init__("\n".join(problems))
         self.problems = problems
+
+
+class ReadingFailed(GatewayError):
+    """The configuration could not be read for want of a process; that says nothing about the file."""
+
+    label = "reading_failed"

@@ -24,7 +24,8 @@ from gateway.cli.config_file import ConfigOption, part_or_exit
 from gateway.errors import ListenError
 from gateway.faces.http.access import read_passwords, read_token
 from gateway.faces.http.clients import PATH
-from gateway.service.schema import HttpTable, parse_listen
+from gateway.service.parsing import parse_listen
+from gateway.service.schema import HttpTable
 
 TIMEOUT_S = 5.0
 _ANY = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104 - where it listens on all, it is asked on loopback

@@ -10,10 +10,9 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from gateway.cli.refusing import counted, refused
 from gateway.errors import ConfigError
 from gateway.service.config import Config, config_of, load_config
-
-EX_CONFIG = 78  # sysexits.h; systemd does not start again after it
 
 ConfigOption = Annotated[Path, typer.Option("--config", "-c", metavar="FILE", help="The configuration file (TOML).")]
 
@@ -52,17 +51,10 @@ def part_or_exit(path: Path, *keys: str) -> Config:
         refuse(path, problems)
     if not raw.keys() <= Config.model_fields.keys():
         refuse(path, problems)
-    print(f"note: check-config names {_count(problems)} in {path}; they do not matter here", file=sys.stderr)
+    print(f"note: check-config names {counted(problems)} in {path}; they do not matter here", file=sys.stderr)
     return part
 
 
 def refuse(path: Path, problems: Sequence[str]) -> NoReturn:
     """Every problem on standard error, and exit status 78."""
-    for problem in problems:
-        print(problem, file=sys.stderr)
-    print(f"{_count(problems)} in {path}", file=sys.stderr)
-    raise typer.Exit(EX_CONFIG) from None
-
-
-def _count(problems: Sequence[str]) -> str:
-    return f"{len(problems)} problem{'s' * (len(problems) != 1)}"
+    raise typer.Exit(refused(path, problems)) from None

@@ -9,7 +9,7 @@ import typer
 
 from gateway.errors import MapError
 from gateway.generate import outputs
-from gateway.service.keys import parse_root
+from gateway.service.parsing import parse_root
 
 
 def command(

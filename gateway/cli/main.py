@@ -19,9 +19,13 @@ def main() -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _leave)
     if sys.argv[1:2] == ["run"]:
-        from gateway.cli.run_app import app  # noqa: PLC0415 - only now are signals handled
-    else:
-        from gateway.cli.app import app  # noqa: PLC0415 - as above
+        from gateway.cli.running import plain_arguments, run  # noqa: PLC0415 - only now are signals handled
+
+        arguments = plain_arguments(sys.argv[2:])
+        if arguments is not None:
+            raise SystemExit(run(arguments))
+    from gateway.cli.app import app  # noqa: PLC0415 - as above
+
     app(prog_name="prostar-gateway")
 
 

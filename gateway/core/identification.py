@@ -7,11 +7,12 @@ get the basic objects, as 6.21 wants. A stream that starts at an unknown object 
 
 from __future__ import annotations
 
-from pymodbus.pdu.mei_message import ReadDeviceInformationResponse
+from collections.abc import Mapping
 
 from gateway.core.policy import READ_DEVICE_IDENTIFICATION
 from gateway.devices.model import Identification
 from gateway.errors import IllegalDataAddress, IllegalDataValue, IllegalFunction
+from gateway.modbus.pdu import IDENTIFICATION_HEADER, MAX_PDU, MORE_FOLLOWS
 
 MEI_TYPE = 0x0E
 CONFORMITY = 0x81  # basic, stream and individual access
@@ -46,6 +47,16 @@ def identify(pdu: bytes, identification: Identification | None) -> bytes | None:
     else:
         start = wanted if wanted in objects else 0
         chosen = {number: text for number, text in objects.items() if number >= start}
-    response = ReadDeviceInformationResponse(read_code=code, information=chosen)
-    response.conformity = CONFORMITY
-    return bytes((READ_DEVICE_IDENTIFICATION,)) + response.encode()
+    return _reply(code, chosen)
+
+
+def _reply(code: int, objects: Mapping[int, bytes]) -> bytes:
+    """As many objects as one PDU takes, and where to go on when it does not take all."""
+    found, count, more, following = b"", 0, 0, 0
+    for number, text in objects.items():
+        if IDENTIFICATION_HEADER + len(found) + 2 + len(text) > MAX_PDU:
+            more, following = MORE_FOLLOWS, number
+            break
+        found += bytes((number, len(text))) + text
+        count += 1
+    return bytes((READ_DEVICE_IDENTIFICATION, MEI_TYPE, code, CONFORMITY, more, following, count)) + found

@@ -62,8 +62,8 @@ def _blocks(maps: tuple[DeviceMap, ...], own: tuple[MetricInfo, ...]) -> Iterato
     yield from _label_values(maps)
     yield "## The gateway itself"
     yield (
-        "Counters begin at 0 when the gateway starts. `process_*` and `python_gc_*` come beside them as "
-        "prometheus-client makes them."
+        "Counters begin at 0 when the gateway starts. `process_*` and `python_gc_*` come beside them, named "
+        "as all Python exporters name them."
     )
     yield table(_HEADINGS, (_info_row(info, ()) for info in own))
 

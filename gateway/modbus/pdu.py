@@ -8,8 +8,8 @@ Rule 3: a reply is right only for the request it answers: the same function, a b
 Rule 4: an exception reply is two bytes, the function with bit 7 set and a code other than 0 (§7). It answers a
         request of that very function and no other.
 
-Reads are packed here because they are on the hot path; identification goes through pymodbus, after its shape
-was checked: pymodbus by itself takes replies whose lengths do not add up.
+tests/modbus/test_pdu.py compares with pymodbus, which by itself takes identification replies whose lengths do not add
+up.
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
-
-from pymodbus.pdu.mei_message import ReadDeviceInformationRequest, ReadDeviceInformationResponse
 
 from gateway.errors import IllegalDataAddress, IllegalDataValue, IllegalFunction, ReplyMismatch
 
@@ -31,9 +29,14 @@ MAX_REGISTERS = 125
 
 EXCEPTION_BIT = 0x80
 _MEI_IDENTIFICATION = 0x0E
-_IDENTIFICATION_HEADER = 7
+IDENTIFICATION_HEADER = 7
+"""Bytes before the objects of an identification reply."""
+
 _COIL_VALUES = (0x0000, 0xFF00)
-_MORE_FOLLOWS = 0xFF
+MORE_FOLLOWS = 0xFF
+"""In an identification reply: the objects go on in another one."""
+
+_BASIC_STREAM = 1
 _INDIVIDUAL_ACCESS = 4
 
 _READ = struct.Struct(">BHH")
@@ -163,21 +166,20 @@ class IdentificationReply:
 
 def read_identification_request(first: int = 0) -> bytes:
     """Ask for the basic identification (vendor, product code, revision) as a stream from object `first` (§6.21)."""
-    request = ReadDeviceInformationRequest(read_code=1, object_id=first)
-    return bytes((request.function_code,)) + request.encode()
+    return bytes((Function.READ_IDENTIFICATION, _MEI_IDENTIFICATION, _BASIC_STREAM, first))
 
 
 def parse_identification(reply: bytes) -> IdentificationReply:
     """Read the objects of an identification reply; raises ReplyMismatch when its structure is wrong."""
     if not _identification_structure_ok(reply):
         raise ReplyMismatch("identification reply with a wrong structure")
-    response = ReadDeviceInformationResponse()
-    response.decode(reply[1:])
-    return IdentificationReply(
-        objects=dict(response.information),
-        more_follows=int(response.more_follows) == _MORE_FOLLOWS,
-        next_id=response.next_object_id,
-    )
+    objects: dict[int, bytes] = {}
+    at = IDENTIFICATION_HEADER
+    while at < len(reply):
+        end = at + 2 + reply[at + 1]
+        objects[reply[at]] = bytes(reply[at + 2 : end])
+        at = end
+    return IdentificationReply(objects, more_follows=reply[4] == MORE_FOLLOWS, next_id=reply[5])
 
 
 def least_identification_size(reply: bytes | bytearray) -> int:
@@ -185,7 +187,7 @@ def least_identification_size(reply: bytes | bytearray) -> int:
 
     It is the exact size as soon as it is not more than `len(reply)`.
     """
-    size = _IDENTIFICATION_HEADER
+    size = IDENTIFICATION_HEADER
     if len(reply) < size:
         return size
     for left in range(reply[6], 0, -1):
@@ -205,14 +207,14 @@ def _check_identification_request(request: bytes) -> None:
 
 
 def _identification_structure_ok(reply: bytes) -> bool:
-    if not _IDENTIFICATION_HEADER <= len(reply) <= MAX_PDU or least_identification_size(reply) != len(reply):
+    if not IDENTIFICATION_HEADER <= len(reply) <= MAX_PDU or least_identification_size(reply) != len(reply):
         return False
     if reply[0] != Function.READ_IDENTIFICATION or reply[1] != _MEI_IDENTIFICATION:
         return False
-    if reply[4] not in {0, _MORE_FOLLOWS}:
+    if reply[4] not in {0, MORE_FOLLOWS}:
         return False
     ids = set()
-    at = _IDENTIFICATION_HEADER
+    at = IDENTIFICATION_HEADER
     while at < len(reply):
         ids.add(reply[at])
         at += 2 + reply[at + 1]
@@ -222,4 +224,4 @@ def _identification_structure_ok(reply: bytes) -> bool:
 def _identification_fits(request: bytes, reply: bytes) -> bool:
     if not _identification_structure_ok(reply) or reply[2] != request[2]:
         return False
-    return request[2] != _INDIVIDUAL_ACCESS or (reply[6] == 1 and reply[_IDENTIFICATION_HEADER] == request[3])
+    return request[2] != _INDIVIDUAL_ACCESS or (reply[6] == 1 and reply[IDENTIFICATION_HEADER] == request[3])

@@ -9,16 +9,20 @@ import ipaddress
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gateway.clock import SystemClock
 from gateway.core.budget import LineBudget
 from gateway.devices.schema import models
 from gateway.devices.unknown import AUTO
 from gateway.service.notify import notify_advice
-from gateway.service.schema import DOCUMENTATION_ROOT, Config, LineTable, parse_listen, parse_root
+from gateway.service.parsing import DOCUMENTATION_ROOT, parse_listen, parse_root
 from gateway.service.snmp import snmp_advice, snmp_on
 from gateway.service.tls import tls_advice
 from gateway.service.writes import write_advice
+
+if TYPE_CHECKING:  # what it is at run time, plain.py says
+    from gateway.service.schema import Config, LineTable
 
 SATURATED = 0.95
 SHORT_TIMEOUT_S = 1.0

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
 
-from gateway.service.config import Config
+from gateway.service.plain import as_mapping
+
+if TYPE_CHECKING:  # what it is at run time, plain.py says
+    from gateway.service.schema import Config
 
 NEEDS_RESTART = ("state_dir",)
 """Keys that a running gateway goes on with as it was started: what is open there is not moved."""
@@ -15,7 +19,7 @@ NAMED = ("line", "device")
 
 def changes(old: Config, new: Config) -> tuple[str, ...]:
     """The keys whose values differ, with their paths; lines and devices are compared by name, other tables by place."""
-    return tuple(_differences("", old.model_dump(), new.model_dump()))
+    return tuple(_differences("", as_mapping(old), as_mapping(new)))
 
 
 def _differences(path: str, old: object, new: object) -> Iterator[str]:

@@ -13,8 +13,10 @@ from pydantic import ValidationError
 
 from gateway.errors import ConfigError
 from gateway.service.crosscheck import cross_problems
-from gateway.service.problems import from_pydantic, in_file_order
+from gateway.service.plain import plain
+from gateway.service.problems import in_file_order
 from gateway.service.schema import Config
+from gateway.service.schema_problems import from_pydantic
 
 __all__ = ["Config", "config_of", "load_config", "parse_config"]
 
@@ -40,7 +42,10 @@ def parse_config(text: str, source: str = "config") -> Config:
 
 
 def config_of(raw: Mapping[str, object], source: str = "config") -> Config:
-    """The configuration in parsed TOML, whatever that holds; ConfigError as `parse_config`."""
+    """The configuration in parsed TOML, whatever that holds; ConfigError as `parse_config`.
+
+    Its tables are those of plain.py.
+    """
     config: Config | None = None
     problems = cross_problems(raw)
     try:
@@ -49,4 +54,4 @@ def config_of(raw: Mapping[str, object], source: str = "config") -> Config:
         problems += from_pydantic(error.errors(include_url=False, include_context=False))
     if config is None or problems:
         raise ConfigError(tuple(f"{source}: {problem}" for problem in in_file_order(problems, raw)))
-    return config
+    return plain(config)

@@ -17,8 +17,9 @@ from gateway.devices.schema import load_map, models
 from gateway.devices.unknown import AUTO
 from gateway.service.emc1 import emc1_problems
 from gateway.service.notify import notify_problems
-from gateway.service.problems import Path, Problem, render_path, show, table_at
-from gateway.service.schema import Address, parse_listen
+from gateway.service.parsing import Address, parse_listen
+from gateway.service.problems import Path, Problem, render_path, show
+from gateway.service.schema_problems import table_at
 from gateway.service.schema_tls import TlsTable
 from gateway.service.snmp import snmp_problems
 from gateway.service.writes import rule_problems

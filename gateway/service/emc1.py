@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from gateway.devices.schema import load_map, models
 from gateway.devices.unknown import AUTO
 from gateway.faces.snmp.settings import Emc1Device
-from gateway.service.keys import parse_listen
+from gateway.service.parsing import parse_listen
 from gateway.service.problems import Path, Problem, show
-from gateway.service.schema import Config
+
+if TYPE_CHECKING:  # what it is at run time, plain.py says
+    from gateway.service.schema import Config
 
 Raw = Mapping[str, object]
 

@@ -27,7 +27,6 @@ from gateway.history.keeper import HistoryKeeper
 from gateway.history.source import HistorySource
 from gateway.lines.factory import Line
 from gateway.service.conditions import ConditionKeeper
-from gateway.service.config import Config
 from gateway.service.models import ModelKeeper
 from gateway.service.parts import Listener, Runnable
 from gateway.service.settings import history_settings, http_settings, line_sites, modbus_settings
@@ -41,6 +40,7 @@ from gateway.service.watchdog import Watchdog
 
 if TYPE_CHECKING:
     from gateway.faces.modbus.tls_files import Credentials
+    from gateway.service.schema import Config
 
 
 @dataclass(frozen=True, slots=True)

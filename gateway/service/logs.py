@@ -88,7 +88,7 @@ def set_up_logging(level: Level, form: Form, handler: logging.Handler) -> None:
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level.upper())
-    for library in ("asyncio", "pymodbus", "pysnmp"):
+    for library in ("asyncio", "pysnmp"):
         logging.getLogger(library).setLevel(logging.DEBUG if level is Level.DEBUG else logging.WARNING)
 
 

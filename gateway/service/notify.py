@@ -7,16 +7,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from gateway.core.conditions import Severity
 from gateway.errors import ConfigError
 from gateway.faces.snmp.secret import Secret
 from gateway.faces.snmp.settings import Receiver
 from gateway.faces.snmp.usm import Credentials
-from gateway.service.keys import DOCUMENTATION_ROOT, parse_listen, parse_root
+from gateway.service.parsing import DOCUMENTATION_ROOT, parse_listen, parse_root
 from gateway.service.problems import Path, Problem, show
-from gateway.service.schema import Config
 from gateway.service.secret_files import open_to_all, read_line, unreadable_text
+
+if TYPE_CHECKING:  # what it is at run time, plain.py says
+    from gateway.service.schema import Config
 
 Raw = Mapping[str, object]
 

@@ -15,17 +15,20 @@ import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gateway import __version__
 from gateway.clock import SystemClock
 from gateway.service.advice import advice
-from gateway.service.config import Config
 from gateway.service.garbage import set_aside
 from gateway.service.gateway import Gateway
 from gateway.service.logs import Log
 from gateway.service.reload import Reloader
 from gateway.service.settings import line_budgets
 from gateway.service.systemd import Systemd
+
+if TYPE_CHECKING:  # what it is at run time, plain.py says
+    from gateway.service.schema import Config
 
 EX_SOFTWARE = 70
 """sysexits.h: an internal mistake was found."""

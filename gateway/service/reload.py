@@ -16,16 +16,21 @@ import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gateway.clock import Clock
 from gateway.core.stats import ServiceStats
-from gateway.errors import ConfigError
+from gateway.errors import ConfigError, ReadingFailed
 from gateway.service.changes import NEEDS_RESTART, changes
-from gateway.service.config import Config, load_config
 from gateway.service.garbage import set_aside
 from gateway.service.gateway import Gateway
 from gateway.service.logs import Log
+from gateway.service.plain import with_values
+from gateway.service.reading import read_config
 from gateway.service.systemd import Systemd
+
+if TYPE_CHECKING:  # what it is at run time, plain.py says
+    from gateway.service.schema import Config
 
 SHOWN = 32
 """How many changed keys, or problems, are logged at most."""
@@ -67,14 +72,17 @@ class Reloader:
         gateway = self._gateway
         before, site = gateway.config, gateway.site
         try:
-            config = await asyncio.to_thread(load_config, self._path)
+            config = await asyncio.to_thread(read_config, self._path)
             for key in (key for key in NEEDS_RESTART if getattr(config, key) != getattr(before, key)):
                 _log.warning("event=reload_needs_restart key=%s kept=old", key)
-            config = config.model_copy(update={key: getattr(before, key) for key in NEEDS_RESTART})
+            config = with_values(config, {key: getattr(before, key) for key in NEEDS_RESTART})
             async with gateway.changing:
                 await self._change(config)
         except ConfigError as error:
             self._refused(error.problems)
+            return
+        except ReadingFailed as error:
+            self._refused((str(error),))
             return
         self._log.use(config.log.level, config.log.form)
         self._stats.reloads["applied"] += 1

@@ -20,13 +20,11 @@ from gateway.core.write_wear import WearLimits
 from gateway.service.keys import (
     A_FILE,
     A_NAME,
-    DOCUMENTATION_ROOT,
     LISTENS,
     LOOPBACK,
     NETWORKS,
     RANGES,
     AbsolutePath,
-    Address,
     Hours,
     Key,
     Listens,
@@ -36,16 +34,11 @@ from gateway.service.keys import (
     Rate,
     Seconds,
     Table,
-    parse_listen,
-    parse_range,
-    parse_root,
 )
 from gateway.service.schema_snmp import CommunityTable, Emc1Table, NotifyTable, SnmpTable, UserTable, ViewTable
 from gateway.service.schema_tls import ROLES, Roles, TlsTable
 
 __all__ = [
-    "DOCUMENTATION_ROOT",
-    "Address",
     "CacheTable",
     "ClientNetworkTable",
     "CommunityTable",
@@ -67,9 +60,6 @@ __all__ = [
     "UserTable",
     "ViewTable",
     "WriteTable",
-    "parse_listen",
-    "parse_range",
-    "parse_root",
 ]
 
 PORT_SCHEMES = ("rfc2217", "socket", "tcp")

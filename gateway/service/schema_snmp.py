@@ -8,22 +8,8 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from gateway.faces.snmp.settings import SnmpSettings
-from gateway.service.keys import (
-    A_TEXT,
-    LISTENS,
-    LOOPBACK,
-    NETWORKS,
-    Key,
-    Listens,
-    Networks,
-    Rate,
-    Seconds,
-    Table,
-    Text,
-    parse_listen,
-    parse_oid,
-    parse_root,
-)
+from gateway.service.keys import A_TEXT, LISTENS, LOOPBACK, NETWORKS, Key, Listens, Networks, Rate, Seconds, Table, Text
+from gateway.service.parsing import parse_listen, parse_oid, parse_root
 
 _DEFAULT = SnmpSettings()
 _SECRET_FILE = "the absolute path of a file, or the name of a systemd credential"  # noqa: S105 - a description

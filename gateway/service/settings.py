@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from gateway.core.budget import WATCH_S, LineBudget, line_budget
@@ -19,9 +20,12 @@ from gateway.devices.unknown import AUTO, UNKNOWN
 from gateway.faces.http.settings import HttpSettings
 from gateway.faces.modbus.settings import LineListen, ModbusSettings, Network, RateSettings
 from gateway.history.settings import HistorySettings
-from gateway.service.schema import Config, LineTable, RateTable, parse_listen
+from gateway.service.parsing import parse_listen
 from gateway.service.tls import tls_settings
 from gateway.service.writes import line_writes, write_rules, write_settings
+
+if TYPE_CHECKING:  # what it is at run time, plain.py says
+    from gateway.service.schema import Config, LineTable, RateTable
 
 Pairs = tuple[tuple[str, int], ...]
 

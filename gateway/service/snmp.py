@@ -10,17 +10,20 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path as FilePath
+from typing import TYPE_CHECKING
 
 from gateway.errors import ConfigError
 from gateway.faces.snmp.secret import Secret
 from gateway.faces.snmp.settings import EVERYTHING, Community, SnmpSettings, User, View
 from gateway.faces.snmp.usm import MIN_PASS_PHRASE, Auth, Credentials, Priv, fits
 from gateway.service.emc1 import emc1_devices
-from gateway.service.keys import parse_oid
 from gateway.service.notify import receivers, unreadable_communities
+from gateway.service.parsing import parse_listen, parse_oid, parse_root
 from gateway.service.problems import Path, Problem, show
-from gateway.service.schema import Config, UserTable, parse_listen, parse_root
 from gateway.service.secret_files import open_to_all, read_line, unreadable_text
+
+if TYPE_CHECKING:  # what it is at run time, plain.py says
+    from gateway.service.schema import Config, UserTable
 
 Raw = Mapping[str, object]
 

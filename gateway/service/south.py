@@ -8,14 +8,16 @@ Rule 2: any other line is a new one. The old one has to stop before it can have 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from gateway.clock import Clock
 from gateway.core.settings import LineSettings
 from gateway.core.site import Device, Site
 from gateway.lines.factory import Line, make_line
-from gateway.service.config import Config
-from gateway.service.schema import DeviceTable
 from gateway.service.settings import line_devices, line_settings, line_sites
+
+if TYPE_CHECKING:  # what it is at run time, plain.py says
+    from gateway.service.schema import Config, DeviceTable
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING
 from gateway.errors import TlsFilesError
 from gateway.faces.modbus.settings import TlsFiles, TlsSettings
 from gateway.faces.modbus.tls_names import Names, wanted_names
-from gateway.service.keys import parse_listen
-from gateway.service.schema import Config
+from gateway.service.parsing import parse_listen
 
 if TYPE_CHECKING:
     from gateway.faces.modbus.tls_files import Credentials
+    from gateway.service.schema import Config
 
 SOON_S = timedelta(days=30).total_seconds()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path as FilePath
+from typing import TYPE_CHECKING
 
 from gateway.core.site import Device
 from gateway.core.write_rules import Network, Range, WriteRule, WriteRules
@@ -14,8 +15,11 @@ from gateway.devices.model import Access, DeviceMap, Point, Space
 from gateway.devices.schema import load_map, models
 from gateway.devices.unknown import AUTO
 from gateway.faces.modbus.settings import WriteSettings
+from gateway.service.parsing import parse_range
 from gateway.service.problems import Path, Problem, show
-from gateway.service.schema import Config, WriteTable, parse_range
+
+if TYPE_CHECKING:  # what it is at run time, plain.py says
+    from gateway.service.schema import Config, WriteTable
 
 Raw = Mapping[str, object]
 

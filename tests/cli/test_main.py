@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -42,17 +41,3 @@ def test_nothing_slow_is_imported_before_the_signals_are_handled() -> None:
         for alias in node.names
     }
     assert top <= {"__future__", "signal", "sys", "types"}
-
-
-def test_run_loads_no_other_command() -> None:
-    shown = [
-        subprocess.run([*start, "run", "--help"], capture_output=True, text=True, check=True)
-        for start in (
-            (sys.executable, "-X", "importtime", "-m", "gateway"),
-            (sys.executable, "-c", "from gateway.cli.app import app; app(prog_name='prostar-gateway')"),
-        )
-    ]
-    loaded = shown[0].stderr
-    assert "gateway.service.gateway" in loaded
-    assert [name for name in ("gateway.cli.demo", "gateway.simulator", "gateway.generate") if name in loaded] == []
-    assert shown[0].stdout == shown[1].stdout

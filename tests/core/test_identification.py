@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pymodbus.pdu.mei_message import ReadDeviceInformationResponse
 
 from gateway.core.identification import identify
 from gateway.devices.model import Identification
@@ -68,3 +69,24 @@ def test_long_texts_never_make_a_pdu_too_long(texts: list[str]) -> None:
     assert parsed.more_follows is (sum(len(text) + 2 for text in texts) > 246)
     for number, data in parsed.objects.items():
         assert data == texts[number].encode("latin-1")
+
+
+@given(st.tuples(*[st.text(st.characters(max_codepoint=255), max_size=244)] * 3), st.integers(0, 2))
+def test_the_reply_is_what_pymodbus_makes(texts: tuple[str, str, str], start: int) -> None:
+    reply = identify(request(1, start), Identification(*texts))
+    objects = {number: text.encode("latin-1") for number, text in enumerate(texts) if number >= start}
+    theirs = ReadDeviceInformationResponse(read_code=1, information=objects)
+    theirs.conformity = 0x81
+    assert reply == b"\x2b" + theirs.encode()
+    assert len(reply) <= 253
+
+
+def test_what_does_not_fit_is_said_to_follow() -> None:
+    long = Identification("v" * 200, "p" * 100, "r" * 3)
+    first = identify(request(1, 0), long)
+    assert first is not None
+    parsed = parse_identification(first)
+    assert (list(parsed.objects), parsed.more_follows, parsed.next_id) == ([0], True, 1)
+    second = identify(request(1, parsed.next_id), long)
+    assert second is not None
+    assert list(parse_identification(second).objects) == [1, 2]

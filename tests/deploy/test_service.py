@@ -81,7 +81,7 @@ def test_its_exposure_is_small(analyze: Analyze, drop_ins: tuple[str, ...]) -> N
 
 
 def test_a_bad_configuration_is_not_tried_again() -> None:
-    from gateway.cli.config_file import EX_CONFIG
+    from gateway.cli.refusing import EX_CONFIG
 
     assert settings(UNIT.name)["RestartPreventExitStatus"] == [str(EX_CONFIG)]
     assert settings(UNIT.name)["Restart"] == ["always"]

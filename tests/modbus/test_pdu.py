@@ -3,6 +3,7 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pymodbus.pdu.mei_message import ReadDeviceInformationResponse
 
 from gateway.errors import IllegalDataAddress, IllegalDataValue, IllegalFunction, ReplyMismatch, RequestError
 from gateway.modbus.pdu import (
@@ -62,6 +63,21 @@ def test_largest_and_last_reads(function: int, address: int, count: int, size: i
     request = ReadRequest(function, address, count)
     assert parse_read(request.encode()) == request
     assert request.reply_size == expected_reply_size(request.encode()) == size
+
+
+@given(
+    st.dictionaries(st.integers(0, 255), st.binary(max_size=20), max_size=8),
+    st.sampled_from((0, 0xFF)),
+    st.integers(0, 255),
+)
+def test_objects_are_those_that_pymodbus_reads(objects: dict[int, bytes], more: int, following: int) -> None:
+    written = b"".join(bytes((number, len(text))) + text for number, text in objects.items())
+    reply = bytes((0x2B, 0x0E, 1, 1, more, following, len(objects))) + written
+    theirs = ReadDeviceInformationResponse()
+    theirs.decode(reply[1:])
+    parsed = parse_identification(reply)
+    assert (parsed.objects, parsed.more_follows, parsed.next_id) == (theirs.information, more == 0xFF, following)
+    assert objects == theirs.information
 
 
 @given(st.binary(max_size=12))

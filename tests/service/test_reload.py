@@ -124,7 +124,7 @@ async def test_a_plan_that_is_not_carried_out_touches_nothing(site: Site) -> Non
         await gateway.plan(site.config(B, FACES, COMMUNITY, "[history]\nenabled = false\n"))
         bad = FACES.replace("[http]", f'[http]\nbearer_token_file = "{site.folder}/none"')
         with pytest.raises(ConfigError) as caught:
-            await gateway.plan(site.config(B, bad, COMMUNITY, site.user("noc")).model_copy())
+            await gateway.plan(site.config(B, bad, COMMUNITY, site.user("noc")))
         assert [problem.split(":")[0] for problem in caught.value.problems] == ["http"]
         assert (gateway.site, gateway.lines, gateway.listeners, gateway.keepers, gateway.config) == before
 

@@ -13,16 +13,13 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Iterator
 
-from prometheus_client import CollectorRegistry, GCCollector, ProcessCollector
-from prometheus_client.exposition import generate_latest
-from prometheus_client.openmetrics.exposition import generate_latest as generate_openmetrics
-
 from gateway.clock import Clock
 from gateway.core.site import Site
 from gateway.faces.http.devices import DeviceMetrics
 from gateway.faces.http.metric import MetricInfo
 from gateway.faces.http.own import Counts, OwnMetrics
 from gateway.faces.http.packing import packer
+from gateway.faces.http.process import process_families
 from gateway.faces.http.text import Format, Lines, header
 
 PIECE_BYTES = 64 * 1024
@@ -48,9 +45,6 @@ class Exposition:
         self._began = clock.monotonic()
         self._offset_s = clock.wall() - self._began
         self._own = OwnMetrics(site, counts, self._started_at)
-        self._process = CollectorRegistry()
-        ProcessCollector(registry=self._process)
-        GCCollector(registry=self._process)
 
     def adjust(self, site: Site, counts: Counts) -> None:
         """Tell of another site from now on; a scrape under way ends as it began. MapError as for a new one."""
@@ -77,7 +71,7 @@ class Exposition:
         size = made = 0
         now, moment = self._clock.monotonic(), devices.look()
         await asyncio.sleep(0)
-        for block in self._blocks(form, devices.families(moment, now), own.families(now)):
+        for block in self._blocks(form, devices.families(moment, now), own.families(now), process_families()):
             piece.append(block)
             size += len(block)
             made += len(block)
@@ -99,11 +93,6 @@ class Exposition:
                     begun = info
                     yield header(info, form)
                 yield b"".join(lines)
-        if form.openmetrics:
-            text: bytes = generate_openmetrics(self._process)  # type: ignore[no-untyped-call]  # as upstream left it
-            yield text.removesuffix(form.end)
-        else:
-            yield generate_latest(self._process)
         yield form.end
 
 

@@ -208,7 +208,7 @@ OWN_METRICS: tuple[MetricInfo, ...] = tuple(
     )
     for rule in rules
 )
-"""Every `prostar_gateway_*` metric; `process_*` and `python_gc_*` come from prometheus-client as they are."""
+"""Every `prostar_gateway_*` metric; `process_*` and `python_gc_*` are in process.py."""
 
 
 def _no_events() -> Mapping[str, int]:

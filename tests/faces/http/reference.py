@@ -178,10 +178,19 @@ def _rules(
         yield rule.metric, [((*labels, *extra), value) for of, labels in known for extra, value in rule.read(of)]
 
 
+class Process:
+    """The process, with the units that its families' names end by."""
+
+    def collect(self) -> Iterator[Metric]:
+        for each in ProcessCollector(registry=None).collect():
+            each.unit = MetricInfo(each.name, MetricKind.GAUGE, "").unit
+            yield each
+
+
 def registry(site: Site, clock: Clock, counts: Counts, started_at: float) -> CollectorRegistry:
     """A registry that renders what the face renders."""
     made = CollectorRegistry()
     made.register(Reference(site, clock, counts, started_at))
-    ProcessCollector(registry=made)
+    made.register(Process())
     GCCollector(registry=made)
     return made

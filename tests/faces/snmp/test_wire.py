@@ -74,3 +74,11 @@ def test_a_response_is_what_pysnmp_reads_back(
     assert int(read[0]) == request_id
     assert [tuple(pair[0]) for pair in read[3]] == [oid for oid, _ in cells]
     assert [int(pair[1].getComponent().getComponent().getComponent()) for pair in read[3]] == [n for _, n in cells]
+
+
+@given(st.integers(0, 255), st.integers(0, 0xFFFF))
+def test_any_tag_stands_before_any_length(tag: int, size: int) -> None:
+    begin = wire.head(tag, size)
+    assert begin[0] == tag
+    assert begin[1:] == (encoder.encode(univ.OctetString(bytes(size)))[1 : len(begin)])
+    assert wire.tlv(tag, bytes(size)) == begin + bytes(size)
