@@ -27,7 +27,7 @@ help: ## Show this list.
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 .PHONY: demo
-demo: $(VENV)/.runtime ## Run four simulated controllers, the gateway and its three faces; Ctrl-C stops.
+demo: $(VENV)/.runtime ## Run simulated controllers, the gateway and its three faces; Ctrl-C stops.
 	@tests/peers/install.sh mbpoll snmp curl || echo 'Going on: the demo runs, but some of the commands it prints are missing.'
 	@exec $(BIN)/python -m gateway demo
 

@@ -1,6 +1,6 @@
-"""`prostar-gateway demo`: the main job on one screen, with simulated controllers on real ptys.
+"""`prostar-gateway demo`: the main job on one screen, with simulated controllers on real ptys and a real TCP port.
 
-The simulator and the gateway are two other processes, started by the same commands that anybody would use
+The simulators and the gateway are other processes, started by the same commands that anybody would use
 (`simulate`, `run`), and the picture is drawn from the gateway's own /metrics: nothing here looks behind the faces.
 
 Rule 1: Ctrl-C, SIGTERM and a closed terminal end everything within two seconds, with exit status 0.
@@ -38,9 +38,13 @@ HOST = "127.0.0.1"
 PROSTAR, TRISTAR = "prostar-mppt", "tristar-mppt"
 LAYOUT = {
     "shelter-a": (("array-1", 1, 11, PROSTAR), ("array-2", 2, 12, PROSTAR)),
-    "shelter-b": (("array-3", 1, 13, PROSTAR), ("array-4", 2, 14, TRISTAR)),
+    "shelter-b": (("array-3", 1, 13, PROSTAR),),
+    "hilltop": (("array-4", 1, 14, TRISTAR),),
 }
-"""Line → its controllers as (name, address, unit id, model): `simulate`'s own layout, two at the factory address."""
+"""Line → its controllers as (name, address, unit id, model): all three have one at the factory address."""
+
+NETWORK = "hilltop"
+"""The line that is a TriStar with a network of its own, which closes each connection after its reply."""
 
 SIMULATION = ("--speed", "120", "--start-hour", "8")
 """A day in twelve minutes, from the morning on."""
@@ -52,11 +56,12 @@ START_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class Ports:
-    """Where the three faces of the demo are."""
+    """Where the three faces of the demo are, and the TriStar."""
 
     modbus: int
     snmp: int
     http: int
+    tristar: int
 
 
 class DemoError(Exception):
@@ -68,10 +73,10 @@ def command(
     snmp_port: Annotated[int, typer.Option(min=1, max=65535, help="UDP port of the SNMP face.")] = 1161,
     http_port: Annotated[int, typer.Option(min=1, max=65535, help="TCP port of the HTTP face.")] = 9850,
 ) -> None:
-    """Run four simulated controllers on two serial lines, the gateway and its three faces, and watch them."""
+    """Run simulated controllers on two serial lines and a network, the gateway and its three faces, and watch them."""
     stop = Stop((signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
     console = Console()
-    ports = Ports(modbus_port, snmp_port, http_port)
+    ports = Ports(modbus_port, snmp_port, http_port, _free_port())
     try:
         _refuse_taken(ports)
         with tempfile.TemporaryDirectory(prefix="prostar-demo-") as folder, _children() as children:
@@ -86,6 +91,13 @@ def command(
             raise
         # Nobody reads any more: `demo | head`, or a terminal that was closed.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+        probe.bind((HOST, 0))
+        port: int = probe.getsockname()[1]
+        return port
 
 
 def _refuse_taken(ports: Ports) -> None:
@@ -117,7 +129,7 @@ def _children() -> Iterator[list[Popen[bytes]]]:
 
 
 class _Running:
-    """The two processes and the scrapes of the gateway."""
+    """The processes and the scrapes of the gateway."""
 
     def __init__(self, folder: Path, ports: Ports, children: list[Popen[bytes]]) -> None:
         self._folder = folder
@@ -127,8 +139,12 @@ class _Running:
 
     def start(self, console: Console, stop: Stop) -> None:
         """Start the simulator and the gateway; returns when all controllers are online, or a signal came."""
-        self._spawn("simulate", "--link-dir", str(self._folder), *SIMULATION)
-        links = [self._folder / line for line in LAYOUT]
+        serial = [line for line in LAYOUT if line != NETWORK]
+        plans = [text for line in serial for text in ("--line", _plan(line))]
+        self._spawn("simulate", "--link-dir", str(self._folder), *plans, *SIMULATION)
+        network = ("--tcp", str(self._ports.tristar), "--close-after-reply", "--line", _plan(NETWORK), "--seed", "3")
+        self._spawn("simulate", *network, *SIMULATION)
+        links = [self._folder / line for line in serial]
         with console.status("Starting the simulated controllers …"):
             self._wait_for(lambda: all(link.exists() for link in links), stop, "the simulated lines to appear")
         config = self._folder / "demo.toml"
@@ -150,15 +166,18 @@ class _Running:
             connection.close()
 
     def _spawn(self, name: str, *arguments: str) -> None:
-        with (self._folder / f"{name}.log").open("wb") as log:
+        with self._log(len(self._children)).open("wb") as log:
             self._children.append(start_gateway_command([name, *arguments], log))
         self._names.append(name)
 
     def _check(self) -> None:
-        for child, name in zip(self._children, self._names, strict=True):
+        for number, (child, name) in enumerate(zip(self._children, self._names, strict=True)):
             if child.poll() is not None:
-                log = "\n".join(last_lines(self._folder / f"{name}.log"))
+                log = "\n".join(last_lines(self._log(number)))
                 raise DemoError(f"prostar-gateway {name} ended with status {child.returncode}:\n{log}")
+
+    def _log(self, number: int) -> Path:
+        return self._folder / f"{number}.log"
 
     def _wait_for(self, condition: Callable[[], bool], stop: Stop, what: str) -> None:
         deadline = time.monotonic() + START_S
@@ -170,15 +189,21 @@ class _Running:
                 return
 
 
+def _plan(line: str) -> str:
+    """A line of the layout as `simulate` wants it."""
+    return f"{line}=" + ",".join(f"{address}:{model}" for _, address, _, model in LAYOUT[line])
+
+
 def _all_online(view: View | None) -> bool:
     return view is not None and all(device.quality == "online" for device in view.devices)
 
 
 def demo_config(folder: Path, ports: Ports) -> str:
-    """The configuration of the demo; the lines are the simulator's links in `folder`."""
+    """The configuration of the demo; the serial lines are the simulator's links in `folder`."""
     text = f'site = "demo"\nstate_dir = "{folder}"\n'
     for line, devices in LAYOUT.items():
-        text += f'\n[[line]]\nname = "{line}"\nport = "{folder / line}"\n'
+        port = f"tcp://{HOST}:{ports.tristar}" if line == NETWORK else folder / line
+        text += f'\n[[line]]\nname = "{line}"\nport = "{port}"\n'
         for name, address, unit, model in devices:
             text += f'[[line.device]]\nname = "{name}"\naddress = {address}\nunit_id = {unit}\nmodel = "{model}"\n'
     text += f'\n[modbus]\nlisten = ["{HOST}:{ports.modbus}"]\n\n[snmp]\nlisten = ["{HOST}:{ports.snmp}"]\n'

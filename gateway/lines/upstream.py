@@ -150,8 +150,12 @@ class UpstreamLine(LineShell):
         """See `Owner`."""
         if link is self._making:
             self._not_made(os.strerror(error).lower())
-        else:
+            return
+        try:
             self._end(link, remote=True)
+        except Exception as bug:  # noqa: BLE001  # as in `_advance`
+            self._broken(bug)
+        else:
             self._advance()
 
     # The first connection, by the hand of `run`
@@ -347,10 +351,13 @@ class UpstreamLine(LineShell):
         """Let the engine act; its mistake ends `run`, which the service starts again, instead of hanging the line."""
         try:
             self._act(data, link)
-        except Exception as error:
-            if self._gone is None or self._gone.done():
-                raise
-            self._gone.set_exception(error)
+        except Exception as error:  # noqa: BLE001  # `run` raises it
+            self._broken(error)
+
+    def _broken(self, error: Exception) -> None:
+        if self._gone is None or self._gone.done():
+            raise error
+        self._gone.set_exception(error)
 
     def _act(self, data: bytes, link: Link | None) -> None:
         """Pass on bytes and time, write what the engine says, set the alarm for its next deadline."""

@@ -119,18 +119,21 @@ def test_without_the_mib_the_commands_are_numeric(tmp_path: Path) -> None:
     assert "mibs" not in text
 
 
-def test_the_demo_has_the_simulators_layout_and_a_right_config(tmp_path: Path) -> None:
+def test_the_demo_has_the_simulators_layout_with_its_tristar_on_a_network_and_a_right_config(tmp_path: Path) -> None:
     simulated = [
         (plan.name, address, plan.models.get(address, "prostar-mppt"))
         for plan in DEMO_LAYOUT
         for address in plan.addresses
     ]
     shown = [(line, address, model) for line, devices in LAYOUT.items() for _, address, _, model in devices]
-    assert shown == simulated
-    text = demo_config(tmp_path, Ports(modbus=1502, snmp=1161, http=9850))
+    tristar = ("shelter-b", 2, "tristar-mppt")
+    assert shown == [*(each for each in simulated if each != tristar), ("hilltop", 1, "tristar-mppt")]
+    assert tristar in simulated
+    text = demo_config(tmp_path, Ports(modbus=1502, snmp=1161, http=9850, tristar=15020))
     config = parse_config(text)
     assert config.modbus.listen == ("127.0.0.1:1502",)
     assert config.snmp.listen == ("127.0.0.1:1161",)
     assert config.snmp.community[0].source == ("127.0.0.0/8",)
     assert config.http.listen == ("127.0.0.1:9850",)
-    assert tomllib.loads(text)["line"][0]["port"] == str(tmp_path / "shelter-a")
+    ports = [line["port"] for line in tomllib.loads(text)["line"]]
+    assert ports == [str(tmp_path / "shelter-a"), str(tmp_path / "shelter-b"), "tcp://127.0.0.1:15020"]

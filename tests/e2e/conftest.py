@@ -40,6 +40,7 @@ def launch(tmp_path: Path, start: Start, free_tcp_port: Callable[[], int], free_
         http_keys: str = "",
         trusted: ssl.SSLContext | None = None,
         models: Mapping[str, str] = MODELS,
+        upstreams: Mapping[str, int] | None = None,
     ) -> Running:
         simulator = None
         if simulate is not None:
@@ -55,6 +56,7 @@ def launch(tmp_path: Path, start: Start, free_tcp_port: Callable[[], int], free_
             modbus_keys=modbus_keys,
             http_keys=http_keys,
             models=models,
+            upstreams=upstreams,
         )
         gateway = start(*GATEWAY, "run", "-c", str(tmp_path / "site.toml"))
         return Running(tmp_path, *ports, gateway, simulator, trusted)

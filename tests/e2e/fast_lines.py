@@ -2,7 +2,8 @@
 
 Reading all registers of the controllers twice takes minutes at 9600 baud; what a register holds is the same.
 With `plants` behind the folder they are `simulate` without `--oracle`: a solar day, and a daily log. With `stranger`
-there is one more, at address 3 of shelter-b, that calls itself something that no map knows.
+there is one more, at address 3 of shelter-b, that calls itself something that no map knows. With a number there is a
+TriStar behind that TCP port, which closes each connection after its reply.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from gateway.simulator.layout import SimulatedSite
 from gateway.simulator.line import SimulatedLine, Station
 from gateway.simulator.oracle import OracleController
 from gateway.simulator.pty import PtyLine
+from gateway.simulator.tcp import TcpServer
+from gateway.simulator.upstream import Habits, SimulatedServer
 
 BAUDRATE = 115200
 LAYOUT = {
@@ -47,6 +50,11 @@ class Stranger(OracleController):
         return {**super().identification(), 1: b"SS-MPPT-15L"}
 
 
+def networked() -> OracleController:
+    """The controller with a network of its own."""
+    return OracleController(load_map("tristar-mppt"), device=4)
+
+
 def plants() -> dict[str, list[SimulatedController]]:
     """The same with a plant each."""
     site = SimulatedSite.build(load_map("prostar-mppt"))
@@ -58,7 +66,7 @@ def plants() -> dict[str, list[SimulatedController]]:
     return found
 
 
-async def run(folder: Path, stations_of: Mapping[str, Sequence[Station]]) -> None:
+async def run(folder: Path, stations_of: Mapping[str, Sequence[Station]], port: int | None) -> None:
     """Serve until SIGTERM."""
     stop = asyncio.Event()
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
@@ -66,11 +74,15 @@ async def run(folder: Path, stations_of: Mapping[str, Sequence[Station]]) -> Non
     lines = [
         PtyLine(SimulatedLine(stations, timing=timing), link=folder / name) for name, stations in stations_of.items()
     ]
+    server = TcpServer(SimulatedServer([networked()], habits=Habits(closes=True)), port=port or 0)
+    if port is not None:
+        await server.open()
     for line in lines:
         line.open()
     await stop.wait()
     for line in lines:
         line.close()
+    server.close()
 
 
 if __name__ == "__main__":
@@ -79,4 +91,4 @@ if __name__ == "__main__":
     }
     if "stranger" in sys.argv:
         chosen["shelter-b"].append(Stranger(load_map("prostar-mppt"), device=9, address=3))
-    asyncio.run(run(Path(sys.argv[1]), chosen))
+    asyncio.run(run(Path(sys.argv[1]), chosen, next((int(word) for word in sys.argv[2:] if word.isdigit()), None)))

@@ -28,7 +28,10 @@ DEMO_DEVICES = (("shelter-a", "array-1", 1, 11), ("shelter-a", "array-2", 2, 12)
 MIXED_DEVICES = (*DEMO_DEVICES, ("shelter-b", "array-4", 2, 14))
 """The same with the TriStar that `simulate` has beside them."""
 
-MODELS: Mapping[str, str] = {"array-4": "tristar-mppt"}
+ALL_DEVICES = (*MIXED_DEVICES, ("hilltop", "array-5", 1, 15))
+"""The same with a TriStar on a network of its own, which closes each connection after its reply."""
+
+MODELS: Mapping[str, str] = {"array-4": "tristar-mppt", "array-5": "tristar-mppt"}
 
 
 class Program:
@@ -159,12 +162,19 @@ def write_config(
     modbus_keys: str = "",
     http_keys: str = "",
     models: Mapping[str, str] = MODELS,
+    upstreams: Mapping[str, int] | None = None,
 ) -> None:
-    """A configuration whose lines are links in the folder of the file; `models` by name, ProStars else."""
+    """A configuration whose lines are links in the folder of the file; `models` by name, ProStars else.
+
+    `upstreams`: the lines that are Modbus TCP servers on this machine, with their ports.
+    """
     modbus, snmp, http = ports
     text = f'site = "ridge-07"\nstate_dir = "{path.parent / "state"}"\n'
     for line in dict.fromkeys(device[0] for device in devices):
-        text += f'[[line]]\nname = "{line}"\nport = "{path.parent / line}"\n{line_keys}\n'
+        if upstreams and line in upstreams:
+            text += f'[[line]]\nname = "{line}"\nport = "tcp://127.0.0.1:{upstreams[line]}"\n'
+        else:
+            text += f'[[line]]\nname = "{line}"\nport = "{path.parent / line}"\n{line_keys}\n'
         for at, name, address, unit in devices:
             if at == line:
                 text += f'[[line.device]]\nname = "{name}"\naddress = {address}\nunit_id = {unit}\n'

@@ -120,7 +120,7 @@ def test_the_printed_commands_work_and_ctrl_c_leaves_nothing(
     for program in ("mbpoll", "snmpwalk", "snmptable", "curl"):
         peer(program)
     demo = terminal(columns=80, rows=24)
-    demo.wait_for(r"14 +array-4[^\n]*online(.|\n)*shelter-b +up +\d+%(.|\n)*/readyz")
+    demo.wait_for(r"14 +array-4[^\n]*online\s+hilltop(.|\n)*hilltop +up +\d+%(.|\n)*/readyz")
     commands = list(dict.fromkeys(COMMAND.findall(demo.text())))
     assert [command.split()[0] for command in commands] == ["mbpoll", "mbpoll", "snmpwalk", "snmptable", "curl", "curl"]
     # Its own words cut at the width of the terminal are the ones that would be pasted.
@@ -139,7 +139,7 @@ def test_the_printed_commands_work_and_ctrl_c_leaves_nothing(
         }[command.split()[0]]
         assert re.search(expected, done.stdout), f"{command}\n{done.stdout}"
     children = children_of(demo.process.pid)
-    assert len(children) == 2
+    assert len(children) == 3
     assert demo.interrupt() < ENDS_S
     assert demo.process.returncode == 0
     assert alive(children) == []
@@ -168,7 +168,7 @@ def test_without_a_terminal_there_are_plain_lines(ports: list[str]) -> None:
         shown = []
         for line in process.stdout:
             shown.append(line.rstrip())
-            if line.startswith("shelter-b up"):
+            if line.startswith("hilltop up"):
                 break
     finally:
         process.send_signal(signal.SIGTERM)
@@ -177,7 +177,7 @@ def test_without_a_terminal_there_are_plain_lines(ports: list[str]) -> None:
     assert said == ""
     assert sum(COMMAND.match(line) is not None for line in shown) == 6
     assert "\x1b" not in "".join(shown)
-    assert re.match(r"shelter-a/array-1 unit=11 battery=[\d.]+V/-?[\d.]+A array=", shown[-6])
+    assert re.match(r"shelter-a/array-1 unit=11 battery=[\d.]+V/-?[\d.]+A array=", shown[-7])
 
 
 def test_a_reader_that_leaves_ends_it(ports: list[str]) -> None:
@@ -262,7 +262,7 @@ def test_a_killed_demo_leaves_no_orphans(terminal: OpenTerminal) -> None:
 def test_a_gateway_that_ends_is_told_with_its_log(terminal: OpenTerminal) -> None:
     demo = terminal()
     demo.wait_for("array-3")
-    _, gateway = children_of(demo.process.pid)
+    *_, gateway = children_of(demo.process.pid)
     os.kill(gateway, signal.SIGKILL)
     demo.ended(time.monotonic())
     assert demo.process.returncode == 1

@@ -21,7 +21,17 @@ from pymodbus.client import ModbusTcpClient
 from gateway.devices.model import DeviceMap, Emc1Form, Group, Kind, Point, PollClass, Space, WordOrder
 from gateway.devices.schema import load_map
 from gateway.faces.snmp.entity import sensors
-from tests.e2e.programs import MIXED_DEVICES, MODELS, REPOSITORY, Launch, Running, Start, environment, wait_until
+from tests.e2e.programs import (
+    ALL_DEVICES,
+    GATEWAY,
+    MODELS,
+    REPOSITORY,
+    Launch,
+    Running,
+    Start,
+    environment,
+    wait_until,
+)
 
 STILL = ("--speed", "0.001", "--start-hour", "11")
 """A simulated noon that does not move while it is looked at."""
@@ -29,7 +39,7 @@ STILL = ("--speed", "0.001", "--start-hour", "11")
 ROOT = "1.3.6.1.4.1.32473.1"
 TABLES = {Group.LIVE: 4, Group.ENERGY: 5, Group.TODAY: 6, Group.SETTINGS: 7}
 PROSTAR, TRISTAR = load_map("prostar-mppt"), load_map("tristar-mppt")
-MAPS = {unit: TRISTAR if name in MODELS else PROSTAR for _, name, _, unit in MIXED_DEVICES}
+MAPS = {unit: TRISTAR if name in MODELS else PROSTAR for _, name, _, unit in ALL_DEVICES}
 PROSTARS = tuple(unit for unit, device_map in MAPS.items() if device_map is PROSTAR)
 
 SCALING = {"voltage_scaling": 0x0000, "current_scaling": 0x0002}
@@ -41,14 +51,17 @@ Values = Mapping[tuple[int, str], Value]
 
 
 @pytest.fixture
-def site(launch: Launch) -> Running:
-    """A gateway over the demo's controllers, all of whose points have been read."""
+def site(launch: Launch, start: Start, free_tcp_port: Callable[[], int]) -> Running:
+    """A gateway over the demo's controllers and a TriStar on a network, all of whose points have been read."""
+    port = free_tcp_port()
+    network = ("--tcp", str(port), "--close-after-reply", "--line", "hilltop=1:tristar-mppt", "--seed", "1")
+    start(*GATEWAY, "simulate", *network, *STILL)
     emc1 = "".join(f"[[snmp.emc1]]\nunit_id = {unit}\n" for unit in PROSTARS)
-    running = launch(simulate=STILL, devices=MIXED_DEVICES, rest=emc1)
+    running = launch(simulate=STILL, devices=ALL_DEVICES, rest=emc1, upstreams={"hilltop": port})
     running.wait_online()
     # Settings are read last of all at start.
     wait_until(
-        lambda: running.get("/metrics")[1].count("morningstar_time_since_equalize_seconds{") == 4, "the settings"
+        lambda: running.get("/metrics")[1].count("morningstar_time_since_equalize_seconds{") == 5, "the settings"
     )
     return running
 
@@ -257,8 +270,8 @@ def test_the_three_faces_agree_on_every_point(site: Running, peer: Callable[[str
         return {(unit, name): expected[unit, name] for unit, name in expected if wanted(MAPS[unit].point(name))}
 
     in_metrics, in_mib = where(lambda point: point.metric), where(lambda point: point.mib)
-    assert len(in_metrics) > 3 * 80 + 90
-    assert len(in_mib) > 3 * 80 + 100
+    assert len(in_metrics) > 3 * 80 + 2 * 90
+    assert len(in_mib) > 3 * 80 + 2 * 100
     for values, shown in ((in_metrics, http), (in_mib, walked)):
         assert differences(values, shown) == []
         assert differences(shown, values) == []
@@ -282,7 +295,7 @@ def test_net_snmp_shows_every_table(site: Running, peer: Callable[[str], str]) -
             continue
         if name in {"pgwClientTable", "pgwLogTable"} and "No entries" in shown[0]:
             continue  # nobody has asked yet, and no history is kept
-        rows = {"pgwLineTable": 2}.get(name, 4)
+        rows = {"pgwLineTable": 3}.get(name, 5)
         assert shown[0] == f"SNMP table: PROSTAR-GATEWAY-MIB::{name}"
         assert len([row for row in shown[3:] if row.strip()]) == rows, name
         assert "array" not in name or "array-1" in "\n".join(shown)
@@ -290,7 +303,7 @@ def test_net_snmp_shows_every_table(site: Running, peer: Callable[[str], str]) -
         assert all(line.startswith("PROSTAR-GATEWAY-MIB::pgw") for line in walked)
         assert len(walked) >= 2 * rows
     devices = snmp(peer, site, "snmptable", "-Ci", "-Cf", "|", "pgwDeviceTable")
-    assert all(name in devices for _, name, _, _ in MIXED_DEVICES)
+    assert all(name in devices for _, name, _, _ in ALL_DEVICES)
 
 
 @pytest.mark.peer
@@ -323,8 +336,8 @@ def test_promtool_and_a_real_prometheus_have_nothing_to_complain_about(
 
     wait_until(lambda: query("count_over_time(up[1m])>3"), "four scrapes")
     assert [float(entry["value"][1]) for entry in query("up")] == [1.0]  # type: ignore[index]
-    assert len(query("morningstar_battery_voltage_volts")) == 4
-    assert len(query("morningstar_charge_state==1")) == 4
+    assert len(query("morningstar_battery_voltage_volts")) == 5
+    assert len(query("morningstar_charge_state==1")) == 5
     assert len(query("scrape_samples_scraped>100")) == 1
     assert prometheus.end() == 0
     complaints = [line for line in prometheus.log().splitlines() if re.search(r"level=(warn|error)", line)]

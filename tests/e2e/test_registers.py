@@ -1,7 +1,8 @@
-"""Every register and coil of the documents, read through the gateway by two unrelated clients, of four controllers.
+"""Every register and coil of the documents, read through the gateway by two unrelated clients, of five controllers.
 
-The controllers' registers all differ (simulator/oracle.py), two of them share an address on different lines: a word
-of another controller, register or moment cannot pass.
+The controllers' registers all differ (simulator/oracle.py), three of them share an address on different lines: a word
+of another controller, register or moment cannot pass. One TriStar is on a serial line, one on a network, where it
+closes each connection after its reply.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from pymodbus.client import ModbusTcpClient
 from gateway.devices.model import Extent, Space
 from gateway.devices.schema import load_map
 from gateway.simulator.oracle import OracleController
-from tests.e2e.fast_lines import BAUDRATE, controllers
-from tests.e2e.programs import MIXED_DEVICES, Launch, Running, Start, environment, wait_until
+from tests.e2e.fast_lines import BAUDRATE, controllers, networked
+from tests.e2e.programs import ALL_DEVICES, Launch, Running, Start, environment, wait_until
 
 DOCUMENTS = {
     "prostar-mppt": {
@@ -31,6 +32,7 @@ DOCUMENTS = {
         Space.COILS: [(0x00, 0xFF), (0x1000, 0x1003), (0x10FF, 0x10FF)],
     },
 }
+POLL = "[poll]\nlive_s = 5.0\n"
 LARGEST = 125  # what mbpoll asks at most, of coils too
 
 
@@ -47,20 +49,21 @@ def held(oracle: OracleController, extent: Extent, first: int, count: int) -> li
 
 
 @pytest.fixture
-def fast_site(launch: Launch, start: Start, tmp_path: Path) -> Running:
+def fast_site(launch: Launch, start: Start, tmp_path: Path, free_tcp_port: Callable[[], int]) -> Running:
     """A gateway over the oracle controllers; polling leaves the lines to the clients."""
-    start(sys.executable, "-m", "tests.e2e.fast_lines", str(tmp_path))
+    port = free_tcp_port()
+    start(sys.executable, "-m", "tests.e2e.fast_lines", str(tmp_path), str(port))
     wait_until((tmp_path / "shelter-b").exists, "the fast lines")
     keys = f"baudrate = {BAUDRATE}"
-    site = launch(simulate=None, devices=MIXED_DEVICES, line_keys=keys, rest="[poll]\nlive_s = 5.0\n")
+    site = launch(simulate=None, devices=ALL_DEVICES, line_keys=keys, rest=POLL, upstreams={"hilltop": port})
     site.wait_online()
     return site
 
 
 def by_unit() -> dict[int, OracleController]:
     """The oracle of each unit id."""
-    flat = [oracle for stations in controllers().values() for oracle in stations]
-    return dict(zip((unit for _, _, _, unit in MIXED_DEVICES), flat, strict=True))
+    flat = [*(oracle for stations in controllers().values() for oracle in stations), networked()]
+    return dict(zip((unit for _, _, _, unit in ALL_DEVICES), flat, strict=True))
 
 
 @pytest.mark.parametrize("model", DOCUMENTS)
@@ -89,7 +92,7 @@ def test_mbpoll_reads_what_each_controller_holds(fast_site: Running, peer: Calla
                 base = 10 if extent.space is Space.COILS else 16
                 assert [int(value, base) for _, value in shown] == held(oracle, extent, first, count)
                 read += count
-    assert read >= 3 * (82 + 80 + 4096 + 256) + 92 + 49 + 7 + 206 + 256 + 5
+    assert read >= 3 * (82 + 80 + 4096 + 256) + 2 * (92 + 49 + 7 + 206 + 256 + 5)
 
 
 def test_pymodbus_reads_what_each_controller_holds(fast_site: Running) -> None:
@@ -113,7 +116,7 @@ def test_pymodbus_reads_what_each_controller_holds(fast_site: Running) -> None:
             assert client.read_holding_registers(0x005C, count=1, device_id=unit).exception_code == 2
             information = client.read_device_information(device_id=unit)
             assert dict(information.information) == oracle.identification()
-    assert read >= 3 * 2 * (82 + 80 + 256) + 3 * 4096 + 2 * (92 + 49 + 7 + 206 + 256 + 5)
+    assert read >= 3 * 2 * (82 + 80 + 256) + 3 * 4096 + 2 * 2 * (92 + 49 + 7 + 206 + 256 + 5)
 
 
 def test_nobody_can_write(fast_site: Running) -> None:
