@@ -48,4 +48,4 @@ async def test_a_controller_costs_little(monkeypatch: pytest.MonkeyPatch) -> Non
                 await site.everything(moment)
             taken.append(allocated())
             del site
-    assert (taken[1] - taken[0]) / 6 / 1024 < 100
+    assert (taken[1] - taken[0]) / 6 / 1024 < 30
