@@ -37,7 +37,7 @@ from gateway.core.accounting import Accounting
 from gateway.core.budget import read_cost
 from gateway.core.device_record import DeviceRecord
 from gateway.core.health import FIRST_PROBE_S, LAST_PROBE_S, Breaker
-from gateway.core.line_news import LineNews
+from gateway.core.line_news import STOPPING, LineNews
 from gateway.core.polling import Polling
 from gateway.core.requests import Lane, PollItem, Purpose, ReadTurn, Turn, Waiter, WriteTurn
 from gateway.core.rewrites import Rewrites
@@ -165,7 +165,7 @@ class LineEngine:
         self._scheduler.polls_changed()
         for record in self._records.values():
             if record.state is DeviceState.ONLINE:
-                self._change(record, DeviceState.STALE, now, reason="line down")
+                self._change(record, DeviceState.STALE, now, reason=STOPPING if self._finishing else "line down")
 
     def read(
         self, device: Device, pdu: bytes, done: Callable[[Outcome], None], now: float, *, client: str, lane: Lane

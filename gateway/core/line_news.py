@@ -9,6 +9,9 @@ from gateway.core.snapshot import DeviceState
 
 log = logging.getLogger(__name__)
 
+STOPPING = "stopping"
+"""Why a device is stale when its line is stopped in order: nobody has to be warned of that."""
+
 
 class LineNews:
     """The news of one line; `quarantine_s` is what is configured."""
@@ -29,7 +32,7 @@ class LineNews:
         """Say that a device has another state than before, which lasted so long."""
         state = device.snapshot.state
         log.log(
-            logging.INFO if state is DeviceState.ONLINE else logging.WARNING,
+            logging.INFO if state is DeviceState.ONLINE or reason == STOPPING else logging.WARNING,
             "event=device_%s line=%s device=%s address=%d before=%s lasted_s=%.1f%s",
             state,
             self._line,

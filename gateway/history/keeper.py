@@ -324,7 +324,8 @@ class HistoryKeeper:
         watch.stats.failures[reason] += 1
         left_out = self._budget.spend((watch.device.name, reason), self._clock.monotonic())
         if left_out is not None:
-            _log.warning(
+            _log.log(
+                logging.INFO if reason == ShuttingDown.label else logging.WARNING,
                 'event=history_harvest_failed device="%s" reason=%s next=retry left_out=%d',
                 watch.device.name, reason, left_out,
             )  # fmt: skip

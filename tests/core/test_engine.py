@@ -446,6 +446,20 @@ def test_a_line_that_stops_ends_the_transaction_on_the_wire_and_refuses_all_else
     assert len(line.sent) == count  # no poll either
 
 
+def test_a_line_that_stops_in_order_is_no_reason_to_warn(
+    virtual_line: MakeLine, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    line = virtual_line(Registers(1))
+    line.run(10.0)
+    line.engine.finish()
+    line.run(1.0)
+    line.engine.closed("closed", line.now)
+    assert line.devices[0].snapshot.state is DeviceState.STALE
+    assert [record.levelname for record in caplog.records if "device_stale" in record.getMessage()] == ["INFO"]
+    assert 'reason="stopping"' in caplog.text
+
+
 def test_what_a_stopping_line_cannot_end_is_refused_as_the_rest(virtual_line: MakeLine) -> None:
     station = Registers(1)
     line = virtual_line(station, reply_timeout_s=10.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 import socket
 import struct
 import time
@@ -48,8 +49,9 @@ async def test_the_wire_is_waited_for_the_queue_is_06_and_nobody_new_gets_in(ser
         assert await on_the_wire.reply() == b""
     assert await service.end() == 0
     assert time.monotonic() - began < 10.0
-    assert "Traceback" not in program.log()
-    assert "stop_late" not in program.log()
+    stopping = program.log().partition("event=stopping")[2]
+    assert "event=device_stale" in stopping
+    assert not re.search("level=(warning|error|critical)|Traceback", stopping)  # it is what was asked for
 
 
 async def test_a_controller_that_takes_for_ever_is_given_up_after_five_seconds(service: Service) -> None:
