@@ -1,12 +1,17 @@
-"""F44: the same EEPROM register written again and again: a budget for each register, 06 beyond it."""
+"""F44: the same EEPROM register written again and again: a budget for each register, 06 beyond it.
+
+The budget is for 24 hours, and so for every hour of them: what a day may cost, no single hour of it can exceed.
+"""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from gateway.core.write_ledger import Fate
+from gateway.core.write_wear import WearLimits
 from gateway.faces.modbus.settings import RateSettings
 from tests.faces.modbus.writing import WALL_OFFSET_S, writing
 
@@ -30,6 +35,23 @@ async def test_values_that_change_have_a_budget_for_each_register(tmp_path: Path
         assert await it.query("06 e001 4b10") == "06e0014b10", "another register has its own"
         it.clock.now += 86_400
         assert await it.query("06 e000 4b02") == "06e0004b02"
+
+
+async def test_a_day_of_a_hundred_writes_a_second_costs_ten_as_the_gateway_is_by_default(tmp_path: Path) -> None:
+    limits = WearLimits()
+    async with writing(tmp_path, per_day=limits.per_day, interval_s=limits.interval_s) as it:
+        written_at: list[float] = []
+        for hour in range(24):  # a quarter of a second of each as fast as that
+            for at in range(25):
+                before = len(it.line.writes)
+                reply = await it.query(f"06 e000 {0x4B00 + (25 * hour + at) % 0xFF:04x}")
+                assert reply == "8606" or reply.startswith("06e000")
+                written_at += [it.clock.now] * (len(it.line.writes) - before)
+                it.clock.now += 0.01
+            it.clock.now += 3599.0
+        assert len(written_at) == limits.per_day == 10
+        assert all(later - earlier >= limits.interval_s for earlier, later in pairwise(written_at))
+        assert set(it.stats.refused) == {"write_too_soon", "write_budget_spent"}
 
 
 async def test_the_budget_survives_a_restart_and_wrong_clocks(tmp_path: Path) -> None:
