@@ -59,7 +59,7 @@ def test_every_row_has_a_test() -> None:
         ("| half a request | {} s |", MODBUS.frame_timeout_s),
         ("| {} replies or", connection.MAX_WAITING),
         ("replies or {} bytes", connection.MAX_UNSENT),
-        ("longer than for {} of its requests", connection.TURN),
+        ("others wait for {} of its requests", connection.TURN),
         ("closed after {} s", MODBUS.write_timeout_s),
         ("| SNMP request | {} bytes |", responder.DATAGRAM_LIMIT),
         ("| SNMP reply | {} bytes |", REPLY_LIMIT),
