@@ -20,7 +20,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from gateway.cli.config_file import ConfigOption, part_or_exit
-from gateway.cli.stopping import Stop
+from gateway.cli.stopping import Stop, stop_event
 from gateway.modbus.recording import Piece, Recording
 from gateway.service.tracing import FILE_NAME
 from gateway.simulator.pty import PtyLine
@@ -131,9 +131,7 @@ def _is_tcp(about: Mapping[str, Any]) -> bool:
 
 
 async def _replay(port: PtyLine | TcpServer[ReplayedServer], recording: Recording, requests: int) -> None:
-    stopped = asyncio.Event()
-    for number in _SIGNALS:
-        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    stopped = stop_event(_SIGNALS)
     async with port:
         where = port.path if isinstance(port, PtyLine) else port.url
         print(f"{recording.about.get('line', '?')} with {requests} different requests at {where}", flush=True)

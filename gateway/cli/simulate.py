@@ -16,6 +16,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from gateway.cli.stopping import stop_event
 from gateway.devices.schema import load_map
 from gateway.errors import MapError
 from gateway.simulator.layout import DEMO_LAYOUT, Behaviour, LinePlan, SimulatedSite
@@ -101,17 +102,9 @@ def _plans(line: list[str] | None, lines: int | None, devices: int) -> tuple[Lin
     return tuple(LinePlan(f"line-{k + 1}", tuple(range(1, devices + 1))) for k in range(lines))
 
 
-def _stop() -> asyncio.Event:
-    """Set by SIGINT and SIGTERM."""
-    stopped = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
-    return stopped
-
-
 async def _run_tcp(site: SimulatedSite, first: int, as_json: bool, *, closes: bool) -> None:
     """The controllers of the site's lines behind servers; its ptys are never opened."""
-    stopped = _stop()
+    stopped = stop_event((signal.SIGINT, signal.SIGTERM))
     habits = Habits(closes=closes)
     buses = [SimulatedServer(port.line.stations, habits=habits, bus=port.line.timing) for port in site.lines]
     servers = [TcpServer(bus, port=first + number if first else 0) for number, bus in enumerate(buses)]
@@ -133,7 +126,7 @@ async def _run_tcp(site: SimulatedSite, first: int, as_json: bool, *, closes: bo
 
 
 async def _run(site: SimulatedSite, as_json: bool) -> None:
-    stopped = _stop()
+    stopped = stop_event((signal.SIGINT, signal.SIGTERM))
     site.open()
     opened_at = asyncio.get_running_loop().time()
     try:

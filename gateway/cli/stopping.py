@@ -7,6 +7,7 @@ writes one byte to a pipe.
 
 from __future__ import annotations
 
+import asyncio
 import os
 import select
 import signal
@@ -35,3 +36,20 @@ class Stop:
     def is_set(self) -> bool:
         """Whether a signal came."""
         return self.wait(0.0)
+
+
+def stop_event(signals: Iterable[signal.Signals]) -> asyncio.Event:
+    """Set by the first of the signals; more of them are ignored from then on, until the interpreter has ended.
+
+    A handler of the loop would not do: when that is closed the system has the signals again, and ends us by them.
+    """
+    numbers, loop, event = tuple(signals), asyncio.get_running_loop(), asyncio.Event()
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        for number in numbers:
+            signal.signal(number, signal.SIG_IGN)
+        loop.call_soon_threadsafe(event.set)
+
+    for number in numbers:
+        signal.signal(number, on_signal)
+    return event

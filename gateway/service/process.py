@@ -1,7 +1,8 @@
 """The life of the process, from start to signal.
 
 Rule 1: the first SIGTERM or SIGINT stops in order (service/supervisor.py), the second ends the process at once.
-        Both leave exit status 0, also while it starts.
+        Both leave exit status 0, also while it starts. When all is over signals are ignored until the interpreter has
+        ended; a loop that handles them gives them back to the system when it is closed, which would end us by them.
 Rule 2: when a part fails again and again, the gateway stops in the same order and leaves exit status 70, upon which
         systemd starts it anew.
 Rule 3: SIGHUP has the configuration read again, and every file that it names (service/reload.py).
@@ -14,7 +15,9 @@ import logging
 import os
 import signal
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING
 
 from gateway import __version__
@@ -46,14 +49,14 @@ async def _serve(path: Path, config: Config, log: Log) -> int:
     running = asyncio.get_running_loop()
     stop = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
-        running.add_signal_handler(number, _stopper(number, stop))
+        _on(number, running, _stopper(number, stop))
     systemd = Systemd(os.environ)
     clock = SystemClock()
     gateway = Gateway(config, clock, systemd)
     gateway.stats.log = log.stats
     reloader = Reloader(path, gateway, clock, systemd, log)
     gateway.keep(reloader)
-    running.add_signal_handler(signal.SIGHUP, reloader.wanted)
+    _on(signal.SIGHUP, running, reloader.wanted)
     for text in advice(config, line_budgets(config)):
         _log.warning('event=advice text="%s"', text.replace('"', "'"))
     _log.info(
@@ -71,6 +74,8 @@ async def _serve(path: Path, config: Config, log: Log) -> int:
     finally:
         herald.cancel()
         told.cancel()
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
     beyond_help = gateway.supervisor.beyond_help
     _log.info("event=stopped status=%d", EX_SOFTWARE if beyond_help else 0)
     return EX_SOFTWARE if beyond_help else 0
@@ -86,6 +91,16 @@ async def _announce(gateway: Gateway, systemd: Systemd) -> None:
 async def _farewell(stop: asyncio.Event, systemd: Systemd) -> None:
     await stop.wait()
     systemd.stopping()
+
+
+def _on(number: signal.Signals, loop: asyncio.AbstractEventLoop, act: Callable[[], None]) -> None:
+    """Have the loop act upon a signal, in its turn; the handler stays when the loop is closed."""
+
+    def handler(_number: int, _frame: FrameType | None) -> None:
+        with suppress(RuntimeError):  # the loop is closed
+            loop.call_soon_threadsafe(act)
+
+    signal.signal(number, handler)
 
 
 def _stopper(number: signal.Signals, stop: asyncio.Event) -> Callable[[], None]:

@@ -109,9 +109,9 @@ class Service:
         """Write the configuration: line, name, address, unit id of each device."""
         write_config(self.config, self.ports, devices, line_keys, rest, modbus_keys=modbus_keys)
 
-    def start(self, **variables: str) -> Program:
+    def start(self, *arguments: str, **variables: str) -> Program:
         """Start the gateway."""
-        self.programs.append(Program([*GATEWAY, "run", "-c", str(self.config)], **variables))
+        self.programs.append(Program([*GATEWAY, "run", "-c", str(self.config), *arguments], **variables))
         return self.programs[-1]
 
     @property

@@ -29,6 +29,24 @@ async def test_a_second_signal_does_not_wait(service: Service, second: signal.Si
     assert "Traceback" not in program.log()
 
 
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize("loop", ["asyncio", "uvloop"])
+async def test_a_signal_when_all_is_over_changes_nothing(service: Service, number: signal.Signals, loop: str) -> None:
+    """The interpreter takes a while to end: what comes then is not what it ends by."""
+    if loop == "uvloop":
+        pytest.importorskip("uvloop")
+    service.configure()
+    program = service.start("--loop", loop)
+    await service.log("event=line_up")
+    program.process.terminate()
+    await service.log("event=stopped")
+    while program.process.poll() is None:
+        program.process.send_signal(number)
+        await asyncio.sleep(0.001)
+    assert await service.end() == 0
+    assert "Traceback" not in program.log()
+
+
 async def test_a_signal_at_any_moment_of_the_start_ends_it_quietly(service: Service) -> None:
     service.configure()
     began = time.monotonic()
