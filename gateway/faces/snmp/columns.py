@@ -3,21 +3,22 @@
 A column is an object of the MIB with the rows that have it. Rules:
 
 1. Nothing is kept of a cell. Its OID is that of the column and the index of the row, its value is read where it is, and
-   both are put together when it is asked for. What numbers look like is kept for all cells together (encodings.py).
+   both are put together when it is asked for. What numbers look like is kept for all cells together (encodings.py), and
+   what is alike for all devices of a model, once a model.
 2. A position is that of a row in its column, from 0 (rows.py). A column looks at a cell in a bounded number of steps,
    and at all rows of a device that shows nothing in one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 
 from gateway.core.site import Device
 from gateway.core.snapshot import DeviceState
 from gateway.devices.model import Value
 from gateway.faces.snmp import wire
 from gateway.faces.snmp.objects import CellValue, Changes, ObjectType, Row
-from gateway.faces.snmp.rows import Rows
+from gateway.faces.snmp.rows import NumberedRows, Rows
 from gateway.faces.snmp.settings import Oid
 
 _ONLINE = DeviceState.ONLINE
@@ -65,6 +66,29 @@ class Column:
         if cell is None:
             return None
         return wire.cell(self.prefix + self.rows.suffix(at), wire.tagged(self._tag, cell, wraps=self._wraps))
+
+
+class AlikeColumn(Column):
+    """One object that is the same in all rows of a kind: its values are kept, one a kind."""
+
+    __slots__ = ("_contents", "_numbered")
+
+    def __init__(self, base: Oid, described: ObjectType, rows: NumberedRows) -> None:
+        super().__init__(base, described, rows)
+        self._numbered = rows
+        self._contents: dict[Hashable, bytes] = {}
+
+    def varbind(self, at: int, now: float) -> bytes | None:
+        """The encoded varbind of a cell, or None when it has no value."""
+        rows = self._numbered
+        kind = rows.kind(at)
+        content = self._contents.get(kind)
+        if content is None:
+            cell = self.object.get(rows.row(at), now)
+            if cell is None:
+                return None
+            content = self._contents[kind] = wire.tagged(self._tag, cell, wraps=self._wraps)
+        return wire.cell(self.prefix + rows.suffix(at), content)
 
 
 class SnapshotColumn(Column):
@@ -155,6 +179,8 @@ class Cell:
 
 def column_of(base: Oid, described: ObjectType, rows: Rows) -> Column:
     """The column of an object, of the kind that suits it."""
+    if described.alike and isinstance(rows, NumberedRows):
+        return AlikeColumn(base, described, rows)
     if described.changes is not Changes.WITH_SNAPSHOT:
         return Column(base, described, rows)
     if described.point is not None and described.encodings is not None:

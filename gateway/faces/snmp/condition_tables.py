@@ -53,7 +53,7 @@ INDEXES = (
 
 def _fixed(number: int, name: str, syntax: Syntax, description: str, get: Callable[..., CellValue]) -> ObjectType:
     return ObjectType(
-        number, name, syntax, description, lambda row, _now: get(row.watch.condition), changes=Changes.NEVER
+        number, name, syntax, description, lambda row, _now: get(row.watch.condition), changes=Changes.NEVER, alike=True
     )
 
 
@@ -88,6 +88,7 @@ CONDITION: tuple[ObjectType, ...] = (
         lambda row, _now: row.watch.condition.severity,
         convention=SEVERITY,
         changes=Changes.NEVER,
+        alike=True,
     ),
     ObjectType(6, "pgwConditionState", Syntax.ENUMERATION, "Whether the condition holds.", _state, convention=STATE),
     ObjectType(

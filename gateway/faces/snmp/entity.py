@@ -110,7 +110,11 @@ def entities(gateway: Gateway, *, sensors_only: bool = False) -> Rows:
     for unit, (_, points) in of_unit.items():
         columns = points if sensors_only else (0, *points)
         numbers += [unit * INDEXES_A_DEVICE + column for column in columns]
-    return NumberedRows(numbers, INDEXES_A_DEVICE, row, lambda unit: of_unit[unit][0] if unit else None)
+
+    def model(unit: int) -> int:
+        return id(of_unit[unit][0].map) if unit else 0
+
+    return NumberedRows(numbers, INDEXES_A_DEVICE, row, lambda unit: of_unit[unit][0] if unit else None, model)
 
 
 def _measures(point: Point) -> bool:
@@ -138,6 +142,8 @@ def _column_of(
     syntax: Syntax,
     parts: tuple[Part, Part, Part | None],
     changes: Changes = Changes.NEVER,
+    *,
+    alike: bool = False,
 ) -> ObjectType:
     """A column from what it is for the gateway, a device and a sensor; None: a sensor has no such cell."""
     gateway, device, sensor = parts
@@ -147,7 +153,7 @@ def _column_of(
         return None if part is None else part(row)
 
     only = None if sensor is not None else lambda row: row.point is None
-    return ObjectType(number, name, syntax, "", get, changes=changes, only=only)
+    return ObjectType(number, name, syntax, "", get, changes=changes, only=only, alike=alike)
 
 
 def _identified(get: Callable[[Identification], str], configured: Callable[[EntityRow], str] = lambda _row: "") -> Part:
@@ -223,6 +229,7 @@ PHYSICAL = Table(
                 lambda row: text(_map(row).title),
                 lambda row: text(_point(row).help),
             ),
+            alike=True,
         ),
         _column_of(
             3,
@@ -238,6 +245,7 @@ PHYSICAL = Table(
             "entPhysicalClass",
             Syntax.ENUMERATION,
             (lambda _row: _CHASSIS, lambda _row: _MODULE, lambda _row: _SENSOR),
+            alike=True,
         ),
         _column_of(
             6,
@@ -276,6 +284,7 @@ PHYSICAL = Table(
             "entPhysicalIsFRU",
             Syntax.ENUMERATION,
             (lambda _row: _TRUE, lambda _row: _TRUE, lambda _row: _FALSE),
+            alike=True,
         ),
     ),
 )
@@ -326,7 +335,16 @@ def _units(row: EntityRow) -> bytes:
 
 
 def _of_sensor(number: int, name: str, syntax: Syntax, part: Part, changes: Changes = Changes.NEVER) -> ObjectType:
-    return ObjectType(number, name, syntax, "", lambda row, _now: part(row), changes=changes, of_values=part is _value)
+    return ObjectType(
+        number,
+        name,
+        syntax,
+        "",
+        lambda row, _now: part(row),
+        changes=changes,
+        of_values=part is _value,
+        alike=changes is Changes.NEVER,
+    )
 
 
 SENSORS = Table(

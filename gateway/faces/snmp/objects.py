@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum, StrEnum
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 from gateway.core.conditions import Conditions, DeviceConditions, Watch
@@ -169,6 +168,7 @@ class ObjectType:
     point: str | None = None  # the map's point; without a shown value of it there is no cell
     only: Callable[[Any], bool] | None = None
     encodings: Mapping[Value, bytes] | None = field(default=None, compare=False, repr=False)  # of a point: by its value
+    alike: bool = False  # never changes, and is the same in all rows of one kind (rows.py)
     of_values: bool = False  # like `point`, of the row's: a device that shows no values has no cell here
 
 
@@ -222,10 +222,10 @@ class Table:
     indexes: tuple[Index, ...] = ()  # its own index objects, behind the one that it borrows
 
 
-@lru_cache(maxsize=1024)
 def text(value: str) -> bytes:
     """`value` as PgwText: UTF-8, cut to 255 octets at a character."""
-    return value.encode()[:255].decode(errors="ignore").encode()
+    octets = value.encode()
+    return octets if len(octets) <= 255 else octets[:255].decode(errors="ignore").encode()
 
 
 def in_range(syntax: Syntax, value: int) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from itertools import accumulate
 from typing import Protocol, TypeVar, overload
 
@@ -89,7 +89,7 @@ class NumberedRows(Rows):
     Each unit has `stride` numbers, those of unit 0 are the gateway's own.
     """
 
-    __slots__ = ("_make", "_numbers", "_octets", "_of", "_starts", "_stride", "_two")
+    __slots__ = ("_make", "_model", "_numbers", "_octets", "_of", "_starts", "_stride", "_two")
 
     def __init__(
         self,
@@ -97,13 +97,18 @@ class NumberedRows(Rows):
         stride: int,
         row: Callable[[int, int], Row],
         device: Callable[[int], Device | None],
+        model: Callable[[int], Hashable],
     ) -> None:
-        """`row` makes the row of a unit and a number among its own, `device` tells whose rows the unit's are."""
+        """`row` makes the row of a unit and a number among its own, `device` tells whose rows the unit's are.
+
+        `model` is the same for units that are alike (`kind`).
+        """
         self._numbers = array("Q", sorted(numbers))
         self._stride = stride
         self._two = stride == 1 << ARC_BITS
         self._make = row
         self._of = device
+        self._model = model
         self.size = len(self._numbers)
         self.indexes = _Made(self.size, self._index)
         octets = [wire.arcs(index) for index in self.indexes]
@@ -119,6 +124,11 @@ class NumberedRows(Rows):
     def suffix(self, at: int) -> bytes:
         """See `Rows`."""
         return self._octets[self._starts[at] : self._starts[at + 1]]
+
+    def kind(self, at: int) -> Hashable:
+        """What the row has in common with those of other units: its model and its number among the unit's own."""
+        unit, number = divmod(self._numbers[at], self._stride)
+        return self._model(unit), number
 
     def device(self, at: int) -> Device | None:
         """See `Rows`."""
@@ -138,7 +148,7 @@ class NumberedRows(Rows):
 
     def only(self, positions: Sequence[int]) -> Rows:
         """See `Rows`."""
-        return NumberedRows((self._numbers[at] for at in positions), self._stride, self._make, self._of)
+        return NumberedRows((self._numbers[at] for at in positions), self._stride, self._make, self._of, self._model)
 
     def behind(self, arcs: Oid) -> int:
         """See `Rows`."""

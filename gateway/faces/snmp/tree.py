@@ -266,7 +266,11 @@ def _conditions(gateway: Gateway) -> Rows:
         return ConditionRow(gateway, watches[code], of)
 
     numbers = (watch.unit_id << ARC_BITS | watch.condition.code for watch in conditions)
-    return NumberedRows(numbers, 1 << ARC_BITS, row, lambda _unit: None)
+
+    def model(unit: int) -> int:
+        return id(conditions.devices[unit].map) if unit else 0
+
+    return NumberedRows(numbers, 1 << ARC_BITS, row, lambda _unit: None, model)
 
 
 _ROWS: Mapping[RowKind, Callable[[Gateway], Rows]] = {

@@ -15,7 +15,7 @@ from gateway.core.snapshot import Snapshot
 from gateway.core.stats import ModbusServerStats
 from gateway.devices.model import DeviceMap
 from gateway.faces.snmp.agent import SnmpAgent
-from gateway.faces.snmp.columns import SnapshotColumn, column_of
+from gateway.faces.snmp.columns import AlikeColumn, Column, SnapshotColumn, column_of
 from gateway.faces.snmp.objects import CellValue, Changes, DeviceRow, Gateway, ObjectType, Syntax
 from gateway.faces.snmp.reader import oid as arcs_of
 from gateway.faces.snmp.responder import DATAGRAM_LIMIT
@@ -81,6 +81,17 @@ def test_a_cell_takes_little_memory_before_and_after_a_walk(
     assert tree.size > 100_000
     assert made / tree.size < OCTETS_A_CELL
     assert walked / tree.size < OCTETS_A_CELL
+
+
+def test_what_is_alike_is_what_each_row_says(agent: SnmpAgent, site: Site, clock: StubClock) -> None:
+    """Of models that differ, in any order, and again from what was kept."""
+    found = [column for column in agent.tree.columns if isinstance(column, AlikeColumn)]
+    assert len({device.map.model for device in site.devices}) > 1
+    assert len(found) > 8
+    for column in found:
+        plain = Column(column.base, column.object, column.rows)
+        for at in (*range(column.size - 1, -1, -1), *range(column.size)):
+            assert column.varbind(at, clock.now) == plain.varbind(at, clock.now)
 
 
 def hostile_requests(agent: SnmpAgent) -> Iterator[bytes]:

@@ -39,7 +39,7 @@ def both(indexes: set[tuple[int, int]], stride: int) -> Both:
         ((unit, number) if two else (unit * stride + number,), entity(unit, number, stride)) for unit, number in indexes
     )
     numbers = [unit * stride + number for unit, number in indexes]
-    return Both(kept, NumberedRows(numbers, stride, lambda u, n: entity(u, n, stride), DEVICES.get))
+    return Both(kept, NumberedRows(numbers, stride, lambda u, n: entity(u, n, stride), DEVICES.get, lambda u: u % 2))
 
 
 @st.composite
