@@ -42,7 +42,7 @@ class Reading:
                 command,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
-                env={**os.environ, "PYTHONPATH": places},
+                env={**os.environ, "PYTHONPATH": places, "PYDANTIC_DISABLE_PLUGINS": "__all__"},
                 process_group=0,  # Ctrl-C is for who waits for it
             )
         except OSError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -186,3 +187,20 @@ async def test_what_a_reload_made_is_set_aside_from_the_collector(site: Site) ->
         assert list(gateway.site.by_unit) == [11, 12]
         assert gc.get_freeze_count() > 10_000
         gc.unfreeze()
+
+
+async def test_without_a_process_that_reads_the_reload_is_refused_and_nothing_else(
+    site: Site, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = site.folder / "site.toml"
+    path.write_text(site.text(A, B, FACES))
+    async with running(site.config(A, FACES)) as gateway:
+        reloader = Reloader(path, gateway, SystemClock(), Systemd({}), Untouched())
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "executable", "/nothing/here")
+            await reloader._reload(0.0)
+        assert list(gateway.site.by_unit) == [11]
+        assert gateway.stats.reloads == {"refused": 1}
+        assert "no process can be started to read it: No such file or directory" in caplog.text
+        await reloader._reload(0.0)
+        assert list(gateway.site.by_unit) == [11, 12]
