@@ -27,7 +27,7 @@ def test_it_fails_at_the_deadline_and_the_next_request_is_clean(rig: MakeRig, se
 
 async def test_over_a_pty(tmp_path: Path) -> None:
     chaos = Chaos(15)
-    async with running(tmp_path, medium=chaos, reply_timeout_s=0.1) as line:
+    async with running(tmp_path, medium=chaos, reply_timeout_s=0.3) as line:
         await line.online()
         for n in range(4):
             chaos.force(Fault.TRUNCATE)

@@ -69,7 +69,7 @@ async def test_the_lock_keeps_others_that_ask_for_it_out(tmp_path: Path) -> None
 
 
 async def test_modem_commands_that_a_stranger_wrote_are_noise(tmp_path: Path) -> None:
-    async with running(tmp_path, reply_timeout_s=0.1) as line:
+    async with running(tmp_path, reply_timeout_s=0.3) as line:
         await line.online()
         stranger = os.open(line.device_path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         try:

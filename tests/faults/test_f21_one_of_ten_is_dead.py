@@ -102,7 +102,7 @@ def test_one_log_line_down_and_one_up_with_the_duration(rig: MakeRig, caplog: py
 
 async def test_over_a_pty(tmp_path: Path) -> None:
     units = [Unit(n) for n in range(3)]
-    async with running(tmp_path, *units, reply_timeout_s=0.1, poll=PollSettings(live_s=0.3)) as line:
+    async with running(tmp_path, *units, reply_timeout_s=0.3, poll=PollSettings(live_s=0.3)) as line:
         await line.online()
         units[1].silent = True
         await line.until(lambda: line.devices[1].snapshot.state is DeviceState.OFFLINE)
