@@ -45,9 +45,6 @@ FINISHED = ""
 """`drop` when the connection is to be ended although nothing is wrong with it."""
 MOST_RETIRED = 1024
 _TIDS = 0x10000
-_NEXT = b"\0\0\0"
-"""What follows the transaction id of any ADU that we send or take: the protocol id, and the length's first byte."""
-
 _ADDRESSES = range(1, 248)
 
 
@@ -92,6 +89,7 @@ class _Request:
     timeout_s: float
     company: bool  # others were under way at some time during its wait
     channel: _Channel
+    reply_size: int | None  # of its PDU; None: its content decides
 
 
 class TcpClient:
@@ -215,7 +213,7 @@ class TcpClient:
         """
         if address not in _ADDRESSES:
             raise ValueError(f"address {address} is not in 1..247")
-        expected_reply_size(pdu)
+        reply_size = expected_reply_size(pdu)
         under_way = self._under_way
         channel = self._free(now)
         if channel is None or (under_way and len(under_way) >= self._window.size):
@@ -226,7 +224,7 @@ class TcpClient:
         if len(under_way) == 1:
             for other in under_way.values():  # who has company already is said to
                 other.company = True
-        under_way[tid] = _Request(tid, self._number, address, pdu, now, timeout_s, company, channel)
+        under_way[tid] = _Request(tid, self._number, address, pdu, now, timeout_s, company, channel, reply_size)
         channel.waiting += 1
         channel.asked_at = min(channel.asked_at, now)
         self._upstream.window = self._window.size
@@ -363,10 +361,26 @@ class TcpClient:
 
     def _check_whole(self, channel: _Channel, adus: Sequence[Adu]) -> None:
         """Rule 1 for a reply that lost its end and was made whole by all of another, so that nothing is left over."""
+        sizes = {2}  # of the replies that others wait for: exceptions, and
+        others = set(channel.retired)  # those whose size nobody knows
+        for tid, request in self._under_way.items():
+            if request.channel is not channel:
+                continue
+            if request.reply_size is None:
+                others.add(tid)
+            else:
+                sizes.add(request.reply_size)
+        heads = [(7 + size, b"\0\0" + (size + 1).to_bytes(2)) for size in sizes]
         for adu in adus:
-            if _NEXT in adu.pdu:
-                asked = {tid for tid, request in self._under_way.items() if request.channel is channel}
-                if any(_ends_with(adu.pdu, tid) for tid in (asked | channel.retired) - {adu.tid}):
+            for length, head in heads:
+                at = len(adu.pdu) - length
+                if at >= 0 and adu.pdu[at + 2 : at + 6] == head:
+                    tid = int.from_bytes(adu.pdu[at : at + 2])
+                    other = self._under_way.get(tid)
+                    if other is not None and other.channel is channel and tid != adu.tid:
+                        channel.drop = "length"
+            for tid in others:
+                if tid != adu.tid and _ends_with(adu.pdu, tid):
                     channel.drop = "length"
 
     def _next_tid(self) -> int:
@@ -383,5 +397,5 @@ class TcpClient:
 
 def _ends_with(pdu: bytes, tid: int) -> bool:
     """Whether the end of a PDU is a whole ADU with that transaction id."""
-    at = pdu.rfind(tid.to_bytes(2) + _NEXT)
+    at = pdu.rfind(tid.to_bytes(2) + b"\0\0\0")  # the protocol id, and the length's first byte
     return 0 <= at < len(pdu) - 5 and at + 6 + pdu[at + 5] == len(pdu)

@@ -14,7 +14,7 @@ from gateway.errors import ConnectionLost, IllegalDataValue, ReplyMismatch, Repl
 from gateway.modbus.counters import RtuCounters, UpstreamCounters
 from gateway.modbus.habits import CLOSES_WITHIN_S, LOOK_AGAIN_S
 from gateway.modbus.mbap import encode
-from gateway.modbus.pdu import Function, ReadRequest, is_exception, reply_fits
+from gateway.modbus.pdu import Function, ReadRequest, is_exception, read_identification_request, reply_fits
 from gateway.modbus.tcp import FINISHED, TcpClient
 from gateway.modbus.transactions import Ended, Failed, Replied
 
@@ -145,16 +145,40 @@ def test_a_reply_that_lost_its_end_is_not_made_whole_by_the_next() -> None:
 
 
 @pytest.mark.parametrize("together", [True, False])
-def test_a_reply_that_lost_its_end_is_not_made_whole_by_all_of_the_next(together: bool) -> None:
+@pytest.mark.parametrize(
+    ("asked", "answered"),
+    [
+        (request(0x20, 1, Function.READ_COILS), b"\1\1\0"),
+        (request(0x20, 1, Function.READ_COILS), b"\x81\2"),
+        (request(0x20, 30), b"\3\x3c" + bytes(60)),
+        (read_identification_request(), bytes.fromhex("2b0e01010000010102") + b"ab"),
+    ],
+)
+def test_a_reply_that_lost_its_end_is_not_made_whole_by_all_of_the_next(
+    asked: bytes, answered: bytes, together: bool
+) -> None:
     client = Client()
     client.widen()
-    one, two = client.send(pdu=request(1, 82)), client.send(pdu=request(0x20, 1, Function.READ_COILS))
-    next_whole = encode(two[0], 1, b"\1\1\0")
+    one, two = client.send(pdu=request(1, 82)), client.send(pdu=asked)
+    next_whole = encode(two[0], 1, answered)
     torn = encode(one[0], 1, reply(one[1]))[: -len(next_whole)]
     pieces = [torn + next_whole] if together else [torn, next_whole]
     assert [ended for piece in pieces for ended in client.tcp.receive(piece, 0.1)] == []
     assert client.tcp.drop == "length"
     assert kinds(client.tcp.lost(0.2, remote=False)) == ["connection_lost"] * 2
+
+
+def test_nor_by_all_of_a_late_one() -> None:
+    client = Client()
+    client.widen()
+    slow, pdu = client.send(now=0.0)
+    quick, _ = client.send(now=0.1)
+    client.tcp.receive(encode(quick, 1, reply(pdu)), 0.5)
+    client.tcp.on_timer(1.0)
+    tid, long = client.send(pdu=request(1, 82), now=1.1)
+    late = encode(slow, 1, reply(pdu))
+    assert client.tcp.receive(encode(tid, 1, reply(long))[: -len(late)] + late, 1.2) == []
+    assert client.tcp.drop == "length"
 
 
 def test_a_late_reply_is_thrown_away_where_later_ones_were_answered() -> None:
