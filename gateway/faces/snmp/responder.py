@@ -208,7 +208,7 @@ class Responder:
             return None
         way = self._known.get(plain[:at])
         if way is not None:
-            return None if way[0].room > room else self._singles.reply(way, plain, window, now)
+            return None if way[-1].room > room else self._singles.reply(way, plain, window, now)
         request_id = plain[at : at + size]
         return self._kept_reply(plain[:at] + plain[at + size :], request_id, window, room, now)
 

@@ -27,6 +27,7 @@ from gateway.faces.snmp.tree import Window
 MOST_BEGINNINGS = 512
 MOST_TAIL = 0x87
 """Octets of a tail whose lengths still take one octet each."""
+
 MOST_NUMBER = 16
 """Octets of an encoded number, its identifier and length among them, are fewer."""
 
@@ -35,9 +36,9 @@ _NULL = b"\x05\x00"
 _ONLINE = DeviceState.ONLINE
 _join = b"".join
 
-Way = tuple["Single", object, slice, slice, slice, dict[bytes, Route], dict[int, tuple[bytes, bytes]]]
-"""A beginning, who may use it, where the request id, frame with prefix, and index with NULL are; the ways to columns,
-and what stands before and behind the request id, by the octets of the value."""
+Way = tuple[object, slice, slice, slice, dict[bytes, Route], dict[int, tuple[bytes, bytes]], "Single"]
+"""Of a beginning: who may use it, where the request id, frame with prefix, and index with NULL are, the ways to
+columns, and what stands before and behind the request id, by the octets of the value."""
 
 
 class Single:
@@ -60,18 +61,18 @@ class Single:
         tail = self._at + self._id_size
         index = tail + len(self._frame) + window.routes.prefix_size
         self.way: Way = (
-            self,
             grant,
             slice(self._at, tail),
             slice(tail, index),
             slice(index, None),
             window.routes.of(self._frame, self._ahead),
             {},
+            self,
         )
 
     def reply(self, data: bytes, now: float) -> bytes | None:
         """The reply to a request for whatever there is, None when it takes the long way."""
-        _, _, id_at, column_at, _, routes, envelopes = self.way
+        _, id_at, column_at, _, routes, envelopes, _ = self.way
         tail = column_at.start
         if len(data) != tail + self._size or not data.startswith(self._frame, tail) or not data.endswith(_NULL):
             return None
@@ -120,7 +121,7 @@ class Singles:
 
     def reply(self, way: Way, data: bytes, grant: object, now: float) -> bytes | None:
         """The reply to a request that begins like this by who has these rights, None when it takes the long way."""
-        single, granted, id_at, column_at, row_at, routes, envelopes = way
+        granted, id_at, column_at, row_at, routes, envelopes, single = way
         if granted is not grant:
             return None
         try:
@@ -148,7 +149,7 @@ class Singles:
         beginning = data[: request.id_at]
         known = self.known.get(beginning)
         if known is not None:
-            single = known[0]
+            single = known[-1]
             if single.grant is grant and single.window is window and single.room == room:
                 return
         elif len(self.known) >= MOST_BEGINNINGS:
