@@ -172,7 +172,11 @@ class SnmpTable(Table):
     v1: Annotated[bool, Key("true or false", "Communities may be used with SNMPv1 too.")] = False
     requests_per_s: Annotated[
         Rate,
-        Key("1.0 to 1000000.0", "Requests of one address in the long run; ten seconds' worth may come at once."),
+        Key(
+            "1.0 to 1000000.0",
+            "Requests of one address in the long run; ten seconds' worth may come at once."
+            " One in unusual BER counts once more for every 22 octets.",
+        ),
     ] = Field(default=_DEFAULT.requests_per_s, ge=1.0, le=1e6)
     engine_lost: Annotated[
         Literal["new", "refuse"],

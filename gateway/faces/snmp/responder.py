@@ -30,6 +30,10 @@ _log = logging.getLogger(__name__)
 DATAGRAM_LIMIT = 1472
 """Octets in one Ethernet frame after IPv4 and UDP headers; no request needs more."""
 
+ODD_OCTETS = 22
+"""What only pysnmp can read takes milliseconds: it uses up a request of its source's allowance for each so many octets,
+which take as long as a plain one."""
+
 _PDU_GROWTH = 38
 """Octets of a reply around community and varbinds, at most."""
 
@@ -109,7 +113,7 @@ class Responder:
             counters.bad_community_names += 1
             self.on_authentication_failure(host)
             raise Refused(Refusal.COMMUNITY)
-        request = self._request(data, at, version)
+        request = self._request(data, at, version, source)
         head = data[start:at]
         room = self._limit - len(head) - _PDU_GROWTH
         answer = self._read(Answer(window, request, version, room=room, head=head, grant=source.communities), now)
@@ -191,7 +195,7 @@ class Responder:
         plain, at, room = opened.plain, opened.pdu_at, opened.room
         pdu = self._pdu_again(plain, at, window, room, now)
         if pdu is None:
-            request = self._request(plain, at, reader.VERSION_3)
+            request = self._request(plain, at, reader.VERSION_3, source)
             answer = self._read(Answer(window, request, reader.VERSION_3, room=room, head=None, grant=window), now)
             if request.id_at:
                 self._remember(plain, request, window, answer)
@@ -260,7 +264,7 @@ class Responder:
             windows = communities.get(name) if sign else None
         return None if windows is None else windows.get(context)
 
-    def _request(self, data: bytes, at: int, version: int) -> Request:
+    def _request(self, data: bytes, at: int, version: int, source: Source) -> Request:
         try:
             request: Request | None = reader.plain_request(data, at)
             if version != reader.VERSION_1 or request is None or request.kind != reader.GET_BULK:
@@ -268,6 +272,7 @@ class Responder:
                 return request
         except Unusual:
             pass
+        source.left -= len(data) / ODD_OCTETS
         try:
             request = reader.odd_request(data, at, version)
         except Exception as error:

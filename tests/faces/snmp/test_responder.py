@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from pysnmp.proto.api import v2c
 
 from gateway.core.site import Device, Site
 from gateway.faces.snmp.agent import SnmpAgent
-from gateway.faces.snmp.responder import DATAGRAM_LIMIT, Refusal, Refused
+from gateway.faces.snmp.responder import DATAGRAM_LIMIT, ODD_OCTETS, Refusal, Refused
 from gateway.faces.snmp.settings import REPLY_LIMIT, Community, Oid
 from tests.faces.snmp.stub_site import StubClock
 
@@ -80,6 +81,30 @@ def test_get_answers_in_the_order_asked(answer: Answer) -> None:
     reply = answer(request(v2c.GetRequestPDU, *names))
     assert (reply.status, reply.index) == (0, 0)
     assert reply.names == names
+
+
+def test_what_only_pysnmp_can_read_uses_up_the_allowance_by_its_length(
+    make_agent: Callable[..., SnmpAgent], clock: StubClock
+) -> None:
+    """It takes milliseconds, and so a poller of odd requests would have the event loop to itself."""
+
+    def answered(data: bytes) -> int:
+        agent = make_agent(requests_per_s=10.0)  # and ten seconds' worth at once
+        count = 0
+        while agent.answer(data, LOCAL) is not None:
+            count += 1
+        assert agent.counters.rate_limited == 1
+        return count
+
+    names = [SYS_DESCR] * 60
+    plain, odd = request(v2c.GetRequestPDU, *names), request(v2c.GetRequestPDU, *names, value=v2c.Integer(0))
+    assert answered(plain) == 100
+    assert answered(odd) == math.ceil(100 / (1 + len(odd) / ODD_OCTETS)) == 3
+    agent = make_agent(requests_per_s=10.0)
+    for _ in range(3):
+        assert agent.answer(odd, LOCAL) is not None
+    clock.now += 100.0
+    assert agent.answer(plain, LOCAL) is not None, "it comes back with time"
 
 
 def test_get_tells_missing_instances_from_missing_objects(answer: Answer) -> None:
