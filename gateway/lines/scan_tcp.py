@@ -4,7 +4,8 @@ Rule 1: what is asked is the same on every line (looking.py).
 Rule 2: nobody is at a unit id of which the server says 0A or 0B, or nothing within the time-out. Any other exception is
         a controller's.
 Rule 3: a connection that the server closed after a reply is made anew. One on which a reply did not come, or not the
-        right one, is ended, so that no late reply is taken for the next.
+        right one, is ended, so that no late reply is taken for the next. One that was used before and is closed in
+        place of a reply was closed after the last one, as we asked: the question is put once more, on a new one.
 """
 
 from __future__ import annotations
@@ -24,6 +25,10 @@ LOOK_S = 0.1
 """How long one look at the connection takes."""
 CONNECT_S = 5.0
 _NOBODY = (0x0A, 0x0B)
+
+
+class _ClosedError(Exception):
+    """The server ended the connection in place of a reply."""
 
 
 class TcpScanner(Looker):
@@ -52,11 +57,16 @@ class TcpScanner(Looker):
 
     def _ask(self, address: int, pdu: bytes, timeout_s: float) -> bytes | RequestError | None:
         """See `Looker._ask`."""
+        before = self._sock
         self._tid = (self._tid + 1) & 0xFFFF
         sock = self._connected()
         with contextlib.suppress(OSError):  # it was closed at this moment: the read finds that
             sock.sendall(encode(self._tid, address, pdu))
-        adu = self._receive(sock, time.monotonic() + timeout_s)
+        try:
+            adu = self._receive(sock, time.monotonic() + timeout_s)
+        except _ClosedError:
+            self.close()
+            return self._ask(address, pdu, timeout_s) if sock is before else None
         if adu is None:
             self.close()
             return None
@@ -97,10 +107,10 @@ class TcpScanner(Looker):
                 data = sock.recv(4096)
             except TimeoutError:
                 continue
-            except OSError:
-                return None
+            except OSError as error:
+                raise _ClosedError from error
             if not data:
-                return None
+                raise _ClosedError
             adus = splitter.feed(data)
             if adus:
                 return adus[0]
