@@ -129,6 +129,8 @@ def test_without_the_library_that_encrypts_it_is_refused(
         text = f"{text.partition('[[snmp')[0]}{table}\n{files}"
     (folder / "c.toml").write_text(text)
     monkeypatch.setitem(sys.modules, "cryptography", None)
+    (folder / "sitecustomize.py").write_text('import sys\nsys.modules["cryptography"] = None\n')
+    monkeypatch.syspath_prepend(folder)  # where the process that reads for `run` finds that
     for command in ("check-config", "run"):
         assert run(command, "-c", str(folder / "c.toml")) == 78
         assert f"{key}: needs the Python package cryptography, which is not installed" in capsys.readouterr().err
