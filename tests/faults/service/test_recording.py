@@ -86,7 +86,9 @@ async def test_an_upstream_is_recorded_and_replayed_too(
         service.programs.append(record)
         await until(lambda: "event=trace line=far state=on" in gateway.log())
         simulated.refusing = False
-        await until(lambda: gateway.log().count("event=device_online") == 2)
+        await until(
+            lambda: gateway.log().count("event=device_online") == 2, 130.0
+        )  # a silent one is asked once a minute
         traced = await command("trace", "-c", str(config), "far", "--seconds", "1")
         assert traced.stdout.startswith("far at tcp://127.0.0.1:")
         assert " closed\n" in traced.stdout
@@ -99,7 +101,7 @@ async def test_an_upstream_is_recorded_and_replayed_too(
     config.write_text(text.replace("PORT", port))
     gateway = Program([*GATEWAY, "run", "-c", str(config)])
     service.programs.append(gateway)
-    await until(lambda: gateway.log().count("event=device_online") == 2)
+    await until(lambda: gateway.log().count("event=device_online") == 2, 130.0)  # a silent one is asked once a minute
     assert await asyncio.to_thread(gateway.end) == 0
     assert await asyncio.to_thread(replay.end) == 0
     assert "unknown=0" in replay.log()
