@@ -27,9 +27,7 @@ writing what it returns, and comes back at `next_deadline`. Outcomes are handed 
 
 from __future__ import annotations
 
-import logging
 import math
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from random import Random
 
@@ -38,6 +36,7 @@ from gateway.core.budget import read_cost
 from gateway.core.device_record import DeviceRecord
 from gateway.core.health import FIRST_PROBE_S, LAST_PROBE_S, Breaker
 from gateway.core.line_news import STOPPING, LineNews
+from gateway.core.outcomes import Outcomes
 from gateway.core.polling import Polling
 from gateway.core.requests import Lane, PollItem, Purpose, ReadTurn, Turn, Waiter, WriteTurn
 from gateway.core.rewrites import Rewrites
@@ -68,8 +67,6 @@ from gateway.modbus.collector import Echo
 from gateway.modbus.pdu import EXCEPTION_BIT, Function, is_exception
 from gateway.modbus.rtu_wire import RtuWire
 from gateway.modbus.transactions import Ended, Failed, Replied, Wire
-
-log = logging.getLogger(__name__)
 
 RESTART_S = 15.0
 """How long a device that was told to restart may be silent."""
@@ -117,7 +114,8 @@ class LineEngine:
         self._accounting = Accounting(self.stats, now)
         self._aside = SetAside(self._under_way)
         self._news = LineNews(settings.name, self._wire.quarantine_s(now))
-        self._finished: deque[tuple[Waiter, Outcome]] = deque()
+        self._outcomes = Outcomes(settings.name)
+        self._finish = self._outcomes.add
         self._state = LineState.DOWN
         self._state_since = now
         self._error = "not opened yet"
@@ -249,12 +247,8 @@ class LineEngine:
             self._finish(self._scheduler.drain(), ShuttingDown())
             for waiting in self._aside.clear():
                 self._finish(waiters_of(waiting), ShuttingDown())
-        while self._finished:
-            waiter, outcome = self._finished.popleft()
-            try:
-                waiter.finish(outcome)
-            except Exception:  # the edge to a face: its mistake must not stop the line
-                log.exception("event=outcome_handler_failed line=%s", self.settings.name)
+        if self._outcomes:
+            self._outcomes.hand_out()
         if self._state is LineState.DOWN or self._wire.ready_at(now) > now:
             return None
         turn = self._next(now)
@@ -281,7 +275,7 @@ class LineEngine:
 
     def next_deadline(self, now: float) -> float | None:
         """When the shell must call `on_timer` and `step` again; None: only after an input."""
-        if self._finished:
+        if self._outcomes:
             return now
         if self._state is LineState.DOWN:
             return None
@@ -492,10 +486,6 @@ class LineEngine:
     def _change(self, record: DeviceRecord, state: DeviceState, now: float, reason: str) -> None:
         before = record.state
         self._news.device(record.device, before, record.become(state, now), reason)
-
-    def _finish(self, waiters: Iterable[Waiter], outcome: Outcome) -> None:
-        for waiter in waiters:
-            self._finished.append((waiter, outcome))
 
     def _set_state(self, state: LineState, error: str, now: float) -> None:
         if state is not self._state:
