@@ -287,10 +287,14 @@ def _emc1(device_map: DeviceMap) -> Iterator[str]:
             Emc1Form.FLOAT: point.enumeration is None and point.bits is None,
             Emc1Form.INTEGER: point.enumeration is not None or point.bits is not None,
             Emc1Form.UNSIGNED: point.mib is not None and point.mib.syntax == "Unsigned32",
+            Emc1Form.COUNTS: point.kind is Kind.NUMBER and found.step is not None,
+            Emc1Form.WORD: point.kind is Kind.NUMBER and point.words == 1 and point.space is Space.REGISTERS,
             Emc1Form.BITS: point.bits is not None,
         }
         if not fits[found.form]:
             yield f"point {point.name}: emc1: form {found.form} does not fit the point"
+        if found.step is not None and found.form not in {Emc1Form.COUNTS, Emc1Form.UNSIGNED}:
+            yield f"point {point.name}: emc1: form {found.form} has no step"
 
 
 def _metrics(device_map: DeviceMap) -> Iterator[str]:

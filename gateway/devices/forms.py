@@ -129,10 +129,11 @@ class _Conditions(_Form):
 
 class _Emc1(_Form):
     number: Annotated[int, Field(ge=1)]
-    form: Literal["float", "integer", "unsigned", "bits"]
+    form: Literal["float", "integer", "unsigned", "counts", "word", "bits"]
+    step: Annotated[Number, Field(gt=0)] | None = None
 
     def build(self) -> Emc1Object:
-        return Emc1Object(self.number, Emc1Form(self.form))
+        return Emc1Object(self.number, Emc1Form(self.form), _float(self.step))
 
 
 class _Point(_Reading):

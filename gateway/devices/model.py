@@ -130,16 +130,19 @@ class Emc1Form(StrEnum):
 
     FLOAT = "float"  # a text: "53.9375", "nan"
     INTEGER = "integer"  # the number of an enumeration or of switches
-    UNSIGNED = "unsigned"  # in the point's MIB scale: 0.1 Ah
+    UNSIGNED = "unsigned"  # in steps, or in the point's MIB scale: 0.1 Ah
+    COUNTS = "counts"  # signed, in steps
+    WORD = "word"  # the register as it was read, unsigned
     BITS = "bits"  # four octets, bit 0 first
 
 
 @dataclass(frozen=True, slots=True)
 class Emc1Object:
-    """The point in the flat MIB of that converter; the numbers are the vendor's."""
+    """The point in the flat MIB of that converter; numbers and steps are the vendor's."""
 
     number: int
     form: Emc1Form
+    step: float | None = None  # what one stands for, in the point's unit
 
 
 @dataclass(frozen=True, slots=True)

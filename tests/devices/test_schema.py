@@ -148,6 +148,33 @@ def test_wrong_form_names_the_entry(changed: Change, old: str, new: str, entry: 
             ],
             "point charge_state: emc1: form float does not fit the point",
         ),
+        *(
+            (
+                [
+                    ("[identity]", '[emc1]\nroot = "1.3.6.1.4.1.33333.5"\n\n[identity]'),
+                    (
+                        'units = "millivolts", syntax = "Integer32" }',
+                        f'units = "millivolts", syntax = "Integer32" }}\nemc1 = {{ number = 45, {form} }}',
+                    ),
+                ],
+                f"point battery_voltage: emc1: form {wrong}",
+            )
+            for form, wrong in (
+                ('form = "counts"', "counts does not fit the point"),
+                ('form = "float", step = 2', "float has no step"),
+                ('form = "word", step = 2', "word has no step"),
+            )
+        ),
+        (
+            [
+                ("[identity]", '[emc1]\nroot = "1.3.6.1.4.1.33333.5"\n\n[identity]'),
+                (
+                    'mib = { column = 3, syntax = "Enumeration" }',
+                    'emc1 = { number = 45, form = "counts", step = 1 }',
+                ),
+            ],
+            "point charge_state: emc1: form counts does not fit the point",
+        ),
         (
             [
                 (

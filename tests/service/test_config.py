@@ -430,6 +430,13 @@ def test_udp_and_tcp_do_not_clash_but_a_default_may() -> None:
     assert found.startswith('http.listen[0]: "127.0.0.1:9850" clashes with modbus.listen[0];')
 
 
+@pytest.mark.parametrize("model", ["prostar-mppt", "tristar-mppt"])
+def test_an_emc1_knows_both_models(model: str) -> None:
+    text = MINIMAL.replace("prostar-mppt", model)
+    assert f'"{model}"' in text
+    assert [each.unit_id for each in parse_config(text + "[[snmp.emc1]]\nunit_id = 11\n").snmp.emc1] == [11]
+
+
 def test_a_model_that_an_emc1_does_not_know_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     unknown = replace(load_map("prostar-mppt"), emc1_root=None)
     monkeypatch.setattr("gateway.service.emc1.load_map", lambda _model: unknown)

@@ -4,7 +4,9 @@ That converter is an agent of one controller: flat scalars `root.N.0`, whose num
 
 1. sysDescr says what answers here: this gateway. sysObjectID is the vendor's root, since by that an NMS knows the kind
    of device; sysName is the device's name, since an NMS wants each of its devices to have another one.
-2. A measured value is a text of at most four decimals, and "nan" when the device answers and has no value.
+2. The map says how a model's values are written. A text has at most four decimals, and is "nan" when the device answers
+   and has no value. An integer counts the vendor's fixed steps, whatever the device's own scaling is: what multiplies
+   by the step gets the value. One without a value does not exist.
 3. A bit field is four octets, bit 0 the most significant bit of the first: a reader of 32 bits takes a shorter one
    for "no faults".
 4. Who it is (1 to 3) always answers. Nothing else of a device that is not online exists here, as everywhere.
@@ -41,6 +43,8 @@ _SYNTAXES = {
     Emc1Form.FLOAT: Syntax.TEXT,
     Emc1Form.INTEGER: Syntax.INTEGER32,
     Emc1Form.UNSIGNED: Syntax.UNSIGNED32,
+    Emc1Form.COUNTS: Syntax.INTEGER32,
+    Emc1Form.WORD: Syntax.INTEGER32,
     Emc1Form.BITS: Syntax.BITS,
 }
 
@@ -124,14 +128,16 @@ _WHO = (
 
 
 def _value(point: Point, described: Emc1Object) -> ObjectType:
-    scale = 1 if point.mib is None else point.mib.scale
     of_snapshot: Callable[[Snapshot], CellValue]
     if described.form is Emc1Form.FLOAT:
         of_snapshot = _float_of(point)
     elif described.form is Emc1Form.BITS:
         of_snapshot = _shown_as(point, lambda value: bit_octets(int(value)))
-    elif described.form is Emc1Form.UNSIGNED:
-        of_snapshot = _shown_as(point, lambda value: _within(Syntax.UNSIGNED32, value * scale))
+    elif described.form is Emc1Form.WORD:
+        of_snapshot = _word_of(point)
+    elif described.form in {Emc1Form.UNSIGNED, Emc1Form.COUNTS}:
+        syntax, step = _SYNTAXES[described.form], _step(point, described)
+        of_snapshot = _shown_as(point, lambda value: _within(syntax, value / step))
     else:
         of_snapshot = _shown_as(point, lambda value: _within(Syntax.INTEGER32, value))
 
@@ -139,6 +145,25 @@ def _value(point: Point, described: Emc1Object) -> ObjectType:
         return of_snapshot(row.device.snapshot)
 
     return ObjectType(described.number, "", _SYNTAXES[described.form], "", get, changes=Changes.WITH_SNAPSHOT)
+
+
+def _step(point: Point, described: Emc1Object) -> float:
+    if described.step is not None:
+        return described.step
+    return 1.0 if point.mib is None else 1 / point.mib.scale
+
+
+def _word_of(point: Point) -> Callable[[Snapshot], CellValue]:
+    """The word that the point's value was made of; none where there is no value."""
+
+    def of(snapshot: Snapshot) -> CellValue:
+        block = snapshot.block_of(point) if point.name in snapshot.shown() else None
+        if block is None:
+            return None
+        at = 2 * (point.address - block.first)
+        return int.from_bytes(block.data[at : at + 2], "big")
+
+    return of
 
 
 def _float_of(point: Point) -> Callable[[Snapshot], CellValue]:

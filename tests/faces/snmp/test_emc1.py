@@ -248,7 +248,8 @@ def test_every_model_with_a_root_makes_a_tree(site: Site, model: str) -> None:
         assert all(point.emc1 is None for point in device_map.points)
         return
     device = Device("one", 3, 3, device_map)
-    device.snapshot = online(device_map, 3)
+    words = tuple(Block(each.space, each.first, each.count, bytes(2 * each.count), NOW) for each in device_map.extents)
+    device.snapshot = replace(online(device_map, 3), blocks=words)
     found = [slot for slot in emc1_tree(any_gateway(site), device) if slot.varbind(NOW) is not None]
     assert len(found) == 7 + 3 + sum(point.emc1 is not None for point in device_map.points)
 

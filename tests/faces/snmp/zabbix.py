@@ -1,4 +1,4 @@
-"""How Zabbix reads an EMC-1: what its template for the ProStar MPPT does with the answers.
+"""How Zabbix reads an EMC-1: what its templates for the ProStar MPPT and the TriStar MPPT do with the answers.
 
 - Floats are texts, taken as numbers; one that is none makes its item unsupported.
 - Amp-hours are multiplied by 0.1.
@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 AH_MULTIPLIER = 0.1
@@ -34,3 +35,25 @@ def number(text: str) -> float | None:
     except ValueError:
         return None
     return value if value == value else None  # noqa: PLR0124 - NaN, which Zabbix does not store
+
+
+# The template for the TriStar MPPT: OIDs are 1.3.6.1.4.1.33333.2.N.0. Its integers are multiplied, most of them are cut
+# after two decimals by an expression that takes no minus sign, and its scripts read bit fields as above.
+
+TRISTAR_MULTIPLIERS = {
+    **dict.fromkeys((30, 34, 35, 36, 45), 0.005493164063),
+    **dict.fromkeys((31, 42), 0.00244140625),
+    **dict.fromkeys((33, 44), 0.1098632813),
+    50: 0.1,
+    **dict.fromkeys((46, 48, 49, 52), 1.0),
+}
+TRISTAR_CUT = frozenset({30, 31, 33, 34, 35, 36, 42, 44, 45})
+
+
+def tristar_value(number: int, text: str) -> float | None:
+    """The value of one of its items; None when it becomes unsupported."""
+    value = int(text) * TRISTAR_MULTIPLIERS[number]
+    if number not in TRISTAR_CUT:
+        return value
+    cut = re.match(r"^(\d+)(\.\d{1,2})?", f"{value:.6f}")
+    return None if cut is None else float(cut[0])
