@@ -10,11 +10,14 @@ from collections.abc import Iterator
 
 from gateway.core.site import Device
 from gateway.faces.snmp import reader, wire
-from gateway.faces.snmp.columns import Column
 from gateway.faces.snmp.tree import Window
 
 MOST_CELLS = 1000
 """Of a result made from more cells than this nothing is told: it would cost too much to find out."""
+
+
+RUN = 64
+"""So many cells of a column are read at once, some of which may be too many for the reply."""
 
 
 class Reading:
@@ -121,29 +124,25 @@ class Reading:
     def _column(self, name: bytes, ends: list[int], repetitions: int, left: int, out: list[bytes]) -> None:
         """`repetitions` steps behind one name, as far as they fit."""
         window, now = self._window, self._now
-        place = ends[0]
-        column: Column | None = None
-        at = many = 0
-        for done in range(repetitions):
-            varbind = column.varbind(at, now) if column is not None and at < many else None
-            if varbind is None:
-                found = window.from_place(place, now)
-                if found is None:
-                    ends[0] = window.size
-                    last = name if column is None else column.name(at - 1)
-                    self._rest(last, repetitions - done, left, out)
-                    return
-                place, varbind = found
-                number, at = window.locate(place)
-                column = window.columns[number]
-                many = column.size
-            at += 1
-            place += 1
-            ends[0] = place
-            left -= len(varbind)
-            if left < 0:
+        place, last, done = ends[0], name, 0
+        while done < repetitions:
+            found = window.from_place(place, now)
+            if found is None:
+                ends[0] = window.size
+                self._rest(last, repetitions - done, left, out)
                 return
-            out.append(varbind)
+            number, at = window.locate(found[0])
+            column = window.columns[number]
+            run = column.run(at + 1, min(at + repetitions - done, at + RUN, column.size), now)
+            for varbind in (found[1], *run):
+                left -= len(varbind)
+                if left < 0:
+                    ends[0] = found[0] + 1 + len(run)
+                    return
+                out.append(varbind)
+            done += 1 + len(run)
+            place = ends[0] = found[0] + 1 + len(run)
+            last = column.name(at + len(run))
 
     def _rest(self, name: bytes, repetitions: int, left: int, out: list[bytes]) -> None:
         """`repetitions` steps behind a name that has only the tails behind it."""

@@ -63,6 +63,10 @@ class Rows:
         """Whose the rows from one to before another are."""
         return set(self._devices[start:end])
 
+    def pairs(self, start: int, end: int) -> Iterable[tuple[Device | None, bytes]]:
+        """Device and octets of the index of each of these rows."""
+        return zip(self._devices[start:end], self._suffixes[start:end], strict=True)
+
     def end(self, at: int) -> int:
         """Where the rows of somebody else begin."""
         return self._ends[at]
@@ -141,6 +145,10 @@ class NumberedRows(Rows):
             found.add(self.device(start))
             start = self.end(start)
         return found
+
+    def pairs(self, start: int, end: int) -> Iterable[tuple[Device | None, bytes]]:
+        """See `Rows`."""
+        return ((self.device(at), self.suffix(at)) for at in range(start, end))
 
     def end(self, at: int) -> int:
         """See `Rows`."""

@@ -7,6 +7,8 @@ pyasn1's. What the agent reads is in reader.py.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from gateway.faces.snmp.objects import CellValue, Syntax
 from gateway.faces.snmp.settings import Oid
 
@@ -102,10 +104,13 @@ def cell(name: bytes, content: bytes) -> bytes:
     whole = size + len(content) + 2
     if whole >= 0x80:
         return varbind(tlv(0x06, name), content)
-    return _VARBINDS[whole] + _NAMES[size] + name + content
+    return CELLS[whole] + _NAMES[size] + name + content
 
 
-_VARBINDS, _NAMES = _SHORT[0x30], _SHORT[0x06]
+CELLS: Sequence[bytes] = _SHORT[0x30]
+"""What stands before name and value of a cell, by their octets, up to 127."""
+
+_NAMES = _SHORT[0x06]
 
 
 def counter(oid: Oid, count: int) -> bytes:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -20,7 +22,7 @@ from gateway.faces.snmp.objects import CellValue, Changes, DeviceRow, Gateway, O
 from gateway.faces.snmp.reader import oid as arcs_of
 from gateway.faces.snmp.responder import DATAGRAM_LIMIT
 from gateway.faces.snmp.rows import Rows
-from gateway.faces.snmp.settings import Oid, SnmpSettings
+from gateway.faces.snmp.settings import DEFAULT_ROOT, Oid, SnmpSettings
 from tests.faces.snmp.stub_site import StubClock, StubLine, online
 from tests.faces.snmp.test_responder import LIVE, LOCAL, Reply, request
 
@@ -92,6 +94,29 @@ def test_what_is_alike_is_what_each_row_says(agent: SnmpAgent, site: Site, clock
         plain = Column(column.base, column.object, column.rows)
         for at in (*range(column.size - 1, -1, -1), *range(column.size)):
             assert column.varbind(at, clock.now) == plain.varbind(at, clock.now)
+
+
+@pytest.mark.parametrize("root", [DEFAULT_ROOT, (1, 3, 6, 1, 4, 1, *[4294967295] * 20)], ids=["short", "long"])
+def test_a_run_of_cells_is_one_cell_after_another(
+    make_agent: Callable[..., SnmpAgent], site: Site, clock: StubClock, root: Oid
+) -> None:
+    """Up to the first without a value, wherever it begins; some devices are silent, some lack some points."""
+    tree = make_agent(enterprise_root=root).tree
+    for every, device in enumerate(site.devices):
+        if every % 3 == 2:
+            device.snapshot = Snapshot()
+        elif every % 3 == 1:
+            values = {name: value for name, value in device.snapshot.values.items() if len(name) % 2}
+            device.snapshot = replace(device.snapshot, values={**values, "battery_voltage": math.nan})
+    lengths = set()
+    for column in tree.columns:
+        cells = [column.varbind(at, clock.now) for at in range(column.size)]
+        for start in range(column.size + 1):
+            wanted = list(itertools.takewhile(lambda each: each is not None, cells[start:]))
+            assert column.run(start, column.size, clock.now) == wanted
+            assert column.run(start, min(start + 2, column.size), clock.now) == wanted[:2]
+            lengths.add(len(wanted))
+    assert {0, 1, 2} <= lengths
 
 
 def hostile_requests(agent: SnmpAgent) -> Iterator[bytes]:
