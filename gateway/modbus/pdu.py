@@ -93,7 +93,7 @@ class ReadRequest:
         return 2 + ((self.count + 7) // 8 if self.function in _BIT_READS else 2 * self.count)
 
 
-@lru_cache(maxsize=1024)  # a face, the line and the check of the reply look at the same request
+@lru_cache(maxsize=128)  # a face, the line and the check of the reply soon look at the same request
 def parse_read(pdu: bytes) -> ReadRequest:
     """Read a request PDU of functions 1 to 4.
 
@@ -118,7 +118,7 @@ def is_exception(pdu: bytes) -> bool:
     return bool(pdu) and pdu[0] >= EXCEPTION_BIT
 
 
-@lru_cache(maxsize=256)  # a request is looked at when it goes out, and when its reply comes
+@lru_cache(maxsize=128)  # a request is looked at when it goes out, and when its reply comes
 def expected_reply_size(request: bytes) -> int | None:
     """Bytes of the normal reply PDU; None for Read Device Identification, where its content decides.
 
