@@ -45,9 +45,8 @@ class Connections:
 
     def entered(self, connection: Connection) -> None:
         """It is connected: rule 2."""
-        staying = [other for other in self._live if not other.leaving]
-        surplus = len(staying) + 1 - self.settings.max_connections
-        for other in staying if surplus > 0 else ():
+        surplus = len(self._live) + 1 - self.settings.max_connections
+        for other in tuple(self._live) if surplus > 0 else ():
             if not other.busy:
                 other.abort()
                 self.stats.closed_for_room += 1
@@ -98,11 +97,6 @@ class Connection(asyncio.Protocol):
     def busy(self) -> bool:
         """Whether a request is under way."""
         return self._task is not None
-
-    @property
-    def leaving(self) -> bool:
-        """Whether its end has begun; it is told of that in a later turn of the loop."""
-        return self._transport is None or self._transport.is_closing()
 
     @property
     def local(self) -> tuple[str, int]:
