@@ -17,7 +17,6 @@ from pathlib import Path
 
 import pytest
 
-from gateway.faces.snmp.encodings import MOST_KEPT
 from gateway.simulator.chaos import Fault, all_at
 from tests.soak.process import Held, growth_kib, settled
 from tests.soak.site import Client, Site, get, running, walk
@@ -27,10 +26,7 @@ WARM_UP_S = min(30.0, SOAK_S / 4)
 SAMPLES = 30
 CLIENTS = 8
 RATES = {**all_at(0.01), Fault.CLOSE: 0.0005, Fault.UNPLUG: 0.0005}
-NUMBERS_KIB = 6 * MOST_KEPT * 150 // 1024
-"""What the SNMP agent keeps of numbers that it has encoded, for each of six syntaxes and scales: registers that never
-show the same number twice fill it within the hour, and no further."""
-MOST_GROWTH_KIB = 2048 + (NUMBERS_KIB if SOAK_S > 600 else 0)
+MOST_GROWTH_KIB = 2048
 
 
 async def look(site: Site, snmpbulkwalk: str, until: float, seen: Counter[str]) -> None:
@@ -98,7 +94,7 @@ async def test_everything_at_once(
     faults = sum((chaos.counts for chaos in site.chaos), Counter[Fault]())
     codes = sum((client.codes for client in clients), Counter[int]())
     assert [wrong for client in clients for wrong in client.wrong] == []
-    assert codes[0] > 5 * SOAK_S  # on a machine that is busy with other things, too; 30 a second where it is not
+    assert codes[0] > 20 * SOAK_S
     assert set(faults) >= set(Fault) - {Fault.CLOSE, Fault.UNPLUG}
     assert seen["walks"] >= SOAK_S / 30
     assert seen["scrapes"] >= SOAK_S / 30
