@@ -45,8 +45,10 @@ class Connections:
 
     def entered(self, connection: Connection) -> None:
         """It is connected: rule 2."""
-        surplus = len(self._live) + 1 - self.settings.max_connections
-        for other in tuple(self._live) if surplus > 0 else ():
+        # One that closes and waits for its peer still takes a place: only being aborted frees it.
+        staying = [other for other in self._live if not other.aborted]
+        surplus = len(staying) + 1 - self.settings.max_connections
+        for other in staying if surplus > 0 else ():
             if not other.busy:
                 other.abort()
                 self.stats.closed_for_room += 1
@@ -83,6 +85,7 @@ class Connection(asyncio.Protocol):
     def __init__(self, among: Connections) -> None:
         self._among = among
         self._transport: asyncio.Transport | None = None
+        self.aborted = False  # it ends in a later turn of the loop
         self._buffer = bytearray()
         self._timer: asyncio.TimerHandle | None = None
         self._task: asyncio.Task[None] | None = None  # the request under way
@@ -170,6 +173,7 @@ class Connection(asyncio.Protocol):
 
     def abort(self) -> None:
         """See `Exchange.abort`."""
+        self.aborted = True
         if self._transport is not None:
             self._transport.abort()
 

@@ -156,6 +156,31 @@ async def test_a_request_under_way_makes_no_room_but_not_for_ever(
     assert len(good) == BUSY_FACTOR * most
 
 
+class Ending(asyncio.Transport):
+    """A transport that was told to end, and has not told its protocol yet."""
+
+    told = False
+
+    def abort(self) -> None:
+        self.told = True
+
+    def is_closing(self) -> bool:
+        return self.told
+
+
+async def test_who_makes_room_is_counted_once_however_many_come_in_a_turn(gateway: Gateway) -> None:
+    connections = gateway.face.listeners[0]._connections
+    assert connections is not None
+    most, more = connections.settings.max_connections, 5
+    made = [connections() for _ in range(most + more)]
+    for connection in made:
+        connection.connection_made(Ending())
+    assert gateway.face.stats.closed_for_room == more
+    assert [each.aborted for each in made] == [True] * more + [False] * most
+    for connection in made:
+        connection.connection_lost(None)
+
+
 async def test_stopping_lets_a_reply_under_way_go_out(
     make_gateway: MakeGateway, monkeypatch: pytest.MonkeyPatch
 ) -> None:
