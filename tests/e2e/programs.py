@@ -88,6 +88,10 @@ class Program:
         """Send a signal and wait; gives the exit status."""
         if self.process.poll() is None:
             self.process.send_signal(number)
+        return self.ended(timeout_s)
+
+    def ended(self, timeout_s: float = 30.0) -> int:
+        """Wait until it ends by itself, for a second signal would not let it end in order; gives the exit status."""
         try:
             return self.process.wait(timeout=timeout_s)
         except subprocess.TimeoutExpired:

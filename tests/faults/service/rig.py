@@ -135,6 +135,10 @@ class Service:
         """Send a signal and wait; the exit status."""
         return await asyncio.to_thread(self.programs[-1].end, number)
 
+    async def ended(self) -> int:
+        """Wait until it ends upon the signal that it was sent; the exit status."""
+        return await asyncio.to_thread(self.programs[-1].ended)
+
     def close(self) -> None:
         """End every process and line."""
         for program in self.programs:

@@ -47,7 +47,7 @@ async def test_the_wire_is_waited_for_the_queue_is_06_and_nobody_new_gets_in(ser
         expected = b"\x03\x04" + b"".join(unit.word(at).to_bytes(2) for at in (0xE000, 0xE001))
         assert await on_the_wire.reply() == expected
         assert await on_the_wire.reply() == b""
-    assert await service.end() == 0
+    assert await service.ended() == 0
     assert time.monotonic() - began < 10.0
     stopping = program.log().partition("event=stopping")[2]
     assert "event=device_stale" in stopping
@@ -68,7 +68,7 @@ async def test_a_controller_that_takes_for_ever_is_given_up_after_five_seconds(s
         program.process.terminate()
         assert await asker.reply() == b"\x83\x06"
         assert await asker.reply() == b""
-    assert await service.end() == 0
+    assert await service.ended() == 0
     assert time.monotonic() - began < 10.0
     assert "Traceback" not in program.log()
 
@@ -94,7 +94,7 @@ async def test_a_client_that_reads_nothing_is_cut_off(service: Service) -> None:
             began = time.monotonic()
             program.process.terminate()
             assert await other.reply() == b""
-        assert await service.end() == 0  # the deaf one's socket is still open
+        assert await service.ended() == 0  # the deaf one's socket is still open
     assert time.monotonic() - began < 8.0
     assert "Traceback" not in program.log()
 
@@ -124,6 +124,6 @@ client_ca_file = "{files.client_ca}"
             program.process.terminate()
             for one in (silent, half, frame, scraper):
                 assert await one.reply() == b""
-    assert await service.end() == 0
+    assert await service.ended() == 0
     assert time.monotonic() - began < STOP_GRACE_S
     assert "Traceback" not in program.log()

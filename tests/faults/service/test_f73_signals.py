@@ -43,7 +43,7 @@ async def test_a_signal_when_all_is_over_changes_nothing(service: Service, numbe
     while program.process.poll() is None:
         program.process.send_signal(number)
         await asyncio.sleep(0.001)
-    assert await service.end() == 0
+    assert await service.ended() == 0
     assert "Traceback" not in program.log()
 
 

@@ -24,7 +24,7 @@ async def test_ready_alive_stopping(service: Service, systemd: NotifySocket) -> 
     assert 0.5 < loop.time() - began < 16.0  # 1.6 s where nothing else runs
     program.process.terminate()
     await systemd.next("STOPPING=1")
-    assert await service.end() == 0
+    assert await service.ended() == 0
 
 
 async def test_an_unplugged_line_and_a_dead_controller_do_not_starve_it(

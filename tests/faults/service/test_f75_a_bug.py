@@ -35,7 +35,7 @@ async def test_five_times_in_a_minute_is_exit_status_70(service: Service, tmp_pa
         await service.log("event=giving_up task=.line shelter-a. failures=5")
         assert await asker.reply() == b""
     await asyncio.to_thread(program.process.wait, 10)
-    assert await service.end() == 70
+    assert await service.ended() == 70
     log = program.log()
     assert log.count("event=task_failed") + "\n".join(program.seen).count("event=task_failed") >= 5
     assert "\n".join(program.seen).count("Traceback") == 1
