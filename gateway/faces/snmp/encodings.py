@@ -19,7 +19,7 @@ from gateway.devices.model import Value
 from gateway.faces.snmp import wire
 from gateway.faces.snmp.objects import CellValue, Syntax, in_range
 
-MOST_KEPT = 4096
+MOST_KEPT = 2048
 """About 150 octets each."""
 
 
