@@ -298,9 +298,7 @@ class LineEngine:
             raise LineDown(self._error)
         if record.breaker.is_open:
             raise DeviceOffline(device.name)
-        if not record.verified and (
-            record.known.at or record.known.product or IDENTITY_MISMATCH in device.snapshot.warnings
-        ):
+        if not record.verified and (record.known.expects or IDENTITY_MISMATCH in device.snapshot.warnings):
             raise IdentityUnproven(device.name)
 
     def _next(self, now: float) -> Turn | None:

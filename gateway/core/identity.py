@@ -31,6 +31,11 @@ class Identity:
     counters: Mapping[str, Value] = field(default_factory=dict)
     at: float = 0.0
 
+    @property
+    def expects(self) -> bool:
+        """Whether another unit could be told by this at all."""
+        return bool(self.product or self.revision or self.serial_number or self.counters)
+
     def complaint(self, seen: Identity, growing: tuple[Growing, ...]) -> str | None:
         """Why `seen` is another unit than this one, in words, or None."""
         for what, expected, found in (
