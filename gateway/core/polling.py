@@ -15,6 +15,8 @@ Rule 6: a value that must be written again and again is warned about after three
 Rule 7: a device whose model is to be found is asked who it is until it says that it is of one; from then on it is
         as any other of that model, and never becomes one of another. While it does not, or says something that no map
         knows, that question is what shows that it is there.
+Rule 8: what is expected of a unit (it was configured, or told before) is asked for until it is told, or the unit says
+        that it has no such thing: a lost reply is no proof. What is not expected is tried and never insisted on.
 """
 
 from __future__ import annotations
@@ -44,6 +46,7 @@ ASK_AGAIN_S = 5.0
 
 REWRITE_WARNING_SHARE = 0.75
 _LATER = (0x05, 0x06)  # acknowledged, busy: no answer yet
+_HAS_NONE = (0x01, 0x02, 0x03)
 _REFUSALS_TO_SPLIT = (0x02, 0x03)
 _SMOOTHING = 0.3
 
@@ -146,7 +149,10 @@ class Polling:
                 self._find(item, record, "", now)
             return
         if block is None:
-            record.polls.drop(item)  # the device does not have it: asked once, no failure
+            if code in _HAS_NONE or not _is_expected(item, record):
+                record.polls.drop(item)  # asked once, no failure
+            else:
+                self.failed(item, record, now)
             return
         item.misses += 1
         item.device.stats.failures += 1
@@ -171,10 +177,13 @@ class Polling:
     def failed(self, item: PollItem, record: DeviceRecord, now: float) -> None:
         """A poll brought nothing."""
         item.misses += 1
-        if item.period_s is None:
-            item.due = now + self._settings.poll.live_s
-            if item.misses >= MISSES_TO_OPEN or item.optional:
-                record.polls.drop(item)  # tried, never insisted on
+        if item.period_s is not None:
+            return
+        item.due = now + self._settings.poll.live_s
+        if _is_expected(item, record):
+            self._insist(item, record, now)
+        elif item.misses >= MISSES_TO_OPEN or item.optional:
+            record.polls.drop(item)
 
     def wanted_again(self, record: DeviceRecord, space: Space, address: int, now: float) -> None:
         """An address was written: its old value is forgotten and its block is read next."""
@@ -235,6 +244,14 @@ class Polling:
             record.known = record.known.learned(record.seen())
         return record.verified
 
+    def _insist(self, item: PollItem, record: DeviceRecord, now: float) -> None:
+        """Rule 8."""
+        if item.misses >= MISSES_TO_OPEN:
+            item.due = now + LOOK_AGAIN_S
+        if item.misses == MISSES_TO_OPEN:
+            what = "serial number" if item.purpose is Purpose.SERIAL_NUMBER else "product"
+            log.warning('event=identity_untold device=%s what="%s"', record.device.name, what)
+
     def _find(self, item: PollItem, record: DeviceRecord, product: str, now: float) -> None:
         """Rule 7."""
         item.fresh = True
@@ -278,6 +295,11 @@ def _shows_life(item: PollItem) -> bool:
     if item.block is None:
         return item.purpose is Purpose.IDENTIFY and item.period_s is not None
     return item.block.poll is PollClass.LIVE
+
+
+def _is_expected(item: PollItem, record: DeviceRecord) -> bool:
+    """Whether what is asked here has to be told (rule 8)."""
+    return bool(record.known.serial_number if item.purpose is Purpose.SERIAL_NUMBER else record.known.product)
 
 
 def _first_live(record: DeviceRecord) -> PollItem | None:

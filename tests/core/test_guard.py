@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import pytest
+
 from gateway.core.identity import Identity
 from gateway.core.site import Outcome
 from gateway.core.snapshot import IDENTITY_MISMATCH, DeviceState
 from gateway.devices.schema import load_map
 from gateway.errors import IdentityUnproven
-from gateway.modbus.pdu import Function, ReadRequest
+from gateway.modbus.pdu import Function, ReadRequest, exception_reply
 from gateway.simulator.device import SimulatedController
 from tests.core.virtual_line import MakeLine, VirtualLine
 
@@ -41,3 +43,99 @@ def test_nobody_has_to_wait_for_a_proof_that_is_not_wanted(virtual_line: MakeLin
     line.run(0.5)
     assert state(line) is DeviceState.UNKNOWN
     assert [isinstance(outcome, bytes) for outcome in outcomes] == [True]
+
+
+class Forgetful(SimulatedController):
+    """A unit whose replies to requests that begin with `lost` do not arrive the next `times` times."""
+
+    lost = b""
+    times = 0
+    code = 0  # answers with this exception instead
+
+    def handle(self, pdu: bytes, now: float) -> bytes | None:
+        reply = super().handle(pdu, now)
+        if self.times and self.lost and pdu.startswith(self.lost):
+            self.times -= 1
+            return exception_reply(pdu[0], self.code) if self.code else None
+        return reply
+
+
+def forgetful(lost: bytes, times: int, code: int = 0, **options: object) -> Forgetful:
+    unit = Forgetful(MAP, **options)  # type: ignore[arg-type]  # the tests' own calls
+    unit.lost, unit.times, unit.code = lost, times, code
+    return unit
+
+
+SERIAL_NUMBER = b"\x03\xe0\x80"
+WHO = b"\x2b\x0e"
+MANY = 1_000_000
+
+
+@pytest.mark.parametrize("times", [1, 3, 10])
+def test_a_lost_reply_is_no_way_around_the_configured_serial_number(virtual_line: MakeLine, times: int) -> None:
+    line = virtual_line(forgetful(SERIAL_NUMBER, times, serial_number=OTHERS), expected=Identity(serial_number=MINE))
+    for _ in range(600):
+        line.run(1.0)
+        assert state(line) is not DeviceState.ONLINE
+    assert mismatch(line)
+
+
+@pytest.mark.parametrize("code", [0x04, 0x05, 0x06])
+def test_a_busy_unit_has_not_refused_to_tell_its_serial_number(virtual_line: MakeLine, code: int) -> None:
+    unit = forgetful(SERIAL_NUMBER, 2, code, serial_number=OTHERS)
+    line = virtual_line(unit, expected=Identity(serial_number=MINE))
+    for _ in range(60):
+        line.run(1.0)
+        assert state(line) is not DeviceState.ONLINE
+    assert mismatch(line)
+
+
+@pytest.mark.parametrize("code", [0x01, 0x02, 0x03])
+def test_a_unit_that_has_no_serial_number_is_not_refused_for_it(virtual_line: MakeLine, code: int) -> None:
+    line = virtual_line(forgetful(SERIAL_NUMBER, MANY, code), expected=Identity(serial_number=MINE))
+    line.run(10.0)
+    assert state(line) is DeviceState.ONLINE
+
+
+def test_a_lost_reply_is_no_way_around_the_configured_product(virtual_line: MakeLine) -> None:
+    line = virtual_line(forgetful(WHO, 4), expected=Identity(product="PS-MPPT-99"))
+    for _ in range(200):
+        line.run(1.0)
+        assert state(line) is not DeviceState.ONLINE
+    assert mismatch(line)
+
+
+def test_a_lost_reply_costs_the_right_unit_a_moment_only(virtual_line: MakeLine) -> None:
+    line = virtual_line(forgetful(SERIAL_NUMBER, 2, serial_number=MINE), expected=Identity(serial_number=MINE))
+    line.run(10.0)
+    assert state(line) is DeviceState.ONLINE
+    assert line.devices[0].snapshot.serial_number == MINE
+
+
+@pytest.mark.parametrize(("lost", "before"), [(SERIAL_NUMBER, "serial number"), (WHO, "product")])
+def test_what_a_unit_once_told_is_asked_for_until_it_is_told_again_and_that_is_said(
+    virtual_line: MakeLine, caplog: pytest.LogCaptureFixture, lost: bytes, before: str
+) -> None:
+    unit = forgetful(lost, 0, serial_number=MINE)
+    line = virtual_line(unit)
+    line.run(5.0)
+    assert state(line) is DeviceState.ONLINE
+    unit.times = MANY
+    line.engine.closed("unplugged", line.now)
+    line.engine.opened(line.now)
+    line.run(600.0)
+    assert state(line) is DeviceState.STALE
+    assert caplog.text.count(f'event=identity_untold device=array-1 what="{before}"') == 1
+    line.sent.clear()
+    line.run(600.0)
+    assert 8 <= sum(frame[1:].startswith(lost) for _, frame in line.sent) <= 12
+    unit.times = 0
+    line.run(70.0)
+    assert state(line) is DeviceState.ONLINE
+
+
+@pytest.mark.parametrize("lost", [SERIAL_NUMBER, WHO])
+def test_what_a_unit_never_told_is_not_insisted_on(virtual_line: MakeLine, lost: bytes) -> None:
+    line = virtual_line(forgetful(lost, MANY, serial_number=MINE))
+    line.run(15.0)
+    assert state(line) is DeviceState.ONLINE
