@@ -156,7 +156,7 @@ class Polling:
             return
         item.misses += 1
         item.device.stats.failures += 1
-        if code not in _REFUSALS_TO_SPLIT or item.period_s is None:
+        if code not in _REFUSALS_TO_SPLIT or item.period_s is None or item not in record.polls.items:
             return
         record.polls.items.remove(item)
         record.polls.refused(block.space, block.count)

@@ -15,6 +15,7 @@ from gateway.devices.schema import load_map
 from gateway.errors import IdentityUnproven, LineDown, RelayedSilence, ReplyTimeout
 from gateway.modbus.pdu import Function, ReadRequest
 from gateway.simulator.device import SimulatedController
+from gateway.simulator.plant import plants_of
 from gateway.simulator.upstream import Habits, SimulatedServer
 from tests.core.test_engine import Registers, registers
 from tests.core.virtual_upstream import VirtualUpstream, make_upstream
@@ -327,3 +328,22 @@ def test_another_controller_behind_a_server_that_was_away_is_not_taken_for_the_o
     assert IDENTITY_MISMATCH in rig.devices[0].snapshot.warnings
     assert isinstance(rig.ask(0, registers(0, 10)), IdentityUnproven)
     assert rig.devices[0].snapshot.shown() == {}
+
+
+def test_a_block_that_the_unit_does_not_have_may_be_under_way_when_it_tells_its_product() -> None:
+    """A TriStar without Ethernet, behind a converter that is asked for everything at once."""
+    tristar = load_map("tristar-mppt")
+    without, _ = plants_of(tristar)
+    units = [SimulatedController(tristar, address=address, plant=without, seed=address) for address in (1, 2)]
+    server = SimulatedServer(units, habits=Habits(latency_s=0.05))
+    devices = [Device(f"array-{unit.address}", 10 + unit.address, unit.address, tristar) for unit in units]
+    rig = make_upstream(server, devices, pipelining=8, poll=BUSY)
+    rig.run(30.0)
+    assert rig.engine.stats.upstream is not None
+    assert rig.engine.stats.upstream.window == 8
+    server.refusing = True
+    rig.reset()
+    rig.run(5.0)
+    server.refusing = False
+    rig.run(30.0)
+    assert states(rig) == [DeviceState.ONLINE] * 2
