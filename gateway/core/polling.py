@@ -8,7 +8,7 @@ Rule 3: a device is online once each of its live blocks was read since the line 
         three times in a row. It is stale when one was, or when the line is down; offline from the moment its
         breaker opens until it is online again.
 Rule 4: a unit that is not the expected one is not shown and not asked for anybody; it is looked at again
-        every minute.
+        every minute, as if it had just come: nothing is kept of what was read of it before.
 Rule 5: blocks that the unit's product does not have, by its map, are not asked for once it told its product.
 Rule 6: a value that must be written again and again is warned about after three quarters of its time.
         It is never written by the gateway itself.
@@ -78,12 +78,21 @@ class Polling:
         strange = IDENTITY_MISMATCH in record.device.snapshot.warnings
         record.restart()
         if strange:
+            record.polls.most.clear()
             record.polls.items = self.first(record.device, now)
             return
         items = [item for item in record.polls.items if item.block is not None]
         for item in items:
             item.restart(now)
         record.polls.items = sorted(items + self._once(record.device, now), key=_rank)
+
+    def _look_again(self, record: DeviceRecord, item: PollItem, now: float) -> None:
+        """Rule 4; `item` is under way."""
+        record.restart()
+        item.restart(now)
+        record.polls.most.clear()
+        plan = self.first(record.device, now)
+        record.polls.items = [item if each.pdu == item.pdu else each for each in plan]
 
     def settling(self, record: DeviceRecord, now: float) -> PollItem:
         """The small question that settles a device's missed replies (doubt.py)."""
@@ -117,11 +126,15 @@ class Polling:
                 record.live_started_at = now
         if IDENTITY_MISMATCH in record.device.snapshot.warnings:
             period_s = max(period_s, LOOK_AGAIN_S)
+            if item is _first_live(record):
+                self._look_again(record, item, now)
         item.due = now + period_s
 
     def replied(self, item: PollItem, record: DeviceRecord, event: Replied, now: float) -> None:
         """A poll brought data."""
         item.misses = 0
+        if item.block is not None and item not in record.polls.items:
+            return  # of a plan that is gone, and perhaps of another unit
         if item.block is not None:
             block = item.block
             item.fresh = True

@@ -139,3 +139,84 @@ def test_what_a_unit_never_told_is_not_insisted_on(virtual_line: MakeLine, lost:
     line = virtual_line(forgetful(lost, MANY, serial_number=MINE))
     line.run(15.0)
     assert state(line) is DeviceState.ONLINE
+
+
+def swap(line: VirtualLine, unit: SimulatedController) -> None:
+    """Pull the cable out of one unit and put it into another."""
+    line.wire.stations[:] = [unit]
+
+
+def reopened(line: VirtualLine, unit: SimulatedController) -> None:
+    """The same, with the adapter."""
+    line.engine.closed("unplugged", line.now)
+    line.run(1.0)
+    line.wire.clear()
+    swap(line, unit)
+    line.engine.opened(line.now)
+
+
+def pair() -> tuple[SimulatedController, SimulatedController]:
+    """Two units that differ in product, serial number and counters."""
+    return (
+        SimulatedController(MAP, seed=1, serial_number=MINE),
+        SimulatedController(MAP, seed=2, serial_number=OTHERS),
+    )
+
+
+def test_the_right_unit_is_known_again_though_nobody_saw_the_other_one_go(virtual_line: MakeLine) -> None:
+    mine, other = pair()
+    line = virtual_line(mine)
+    line.run(5.0)
+    reopened(line, other)
+    line.run(100.0)
+    assert mismatch(line)
+    swap(line, mine)
+    line.run(70.0)
+    assert state(line) is DeviceState.ONLINE
+    assert not mismatch(line)
+    assert line.devices[0].snapshot.serial_number == MINE
+
+
+@pytest.mark.parametrize("looks", range(1, 8))
+def test_nothing_that_was_read_of_the_other_unit_is_ever_shown(virtual_line: MakeLine, looks: int) -> None:
+    mine, other = SimulatedController(MAP, seed=1), SimulatedController(MAP, seed=4)
+    other.day.totals.hours_before += 500
+    other.memory.set("absorption_voltage", 13.0)
+    line = virtual_line(mine)
+    line.run(5.0)
+    hours, volts = line.devices[0].snapshot.values["hourmeter"], line.devices[0].snapshot.values["absorption_voltage"]
+    reopened(line, other)
+    line.run(10.0 * looks)
+    swap(line, mine)
+    for _ in range(1000):
+        line.run(0.1)
+        shown = line.devices[0].snapshot.shown()
+        assert shown.get("hourmeter", hours) == hours
+        assert shown.get("absorption_voltage", volts) == volts
+    assert state(line) is DeviceState.ONLINE
+    assert line.devices[0].snapshot.shown()["absorption_voltage"] == volts
+
+
+def test_what_the_other_unit_refused_is_read_of_the_right_one_again(virtual_line: MakeLine) -> None:
+    mine, other = SimulatedController(MAP, seed=1), SimulatedController(load_map("tristar-mppt"), seed=2)
+    line = virtual_line(mine)
+    line.run(5.0)
+    whole = {(block.first, block.count) for block in line.devices[0].snapshot.blocks}
+    reopened(line, other)
+    line.run(200.0)
+    assert mismatch(line)
+    swap(line, mine)
+    line.run(70.0)
+    assert state(line) is DeviceState.ONLINE
+    assert {(block.first, block.count) for block in line.devices[0].snapshot.blocks} == whole
+
+
+def test_another_unit_costs_the_line_one_look_a_minute(virtual_line: MakeLine) -> None:
+    mine, other = pair()
+    line = virtual_line(mine)
+    line.run(5.0)
+    reopened(line, other)
+    line.run(100.0)
+    used_s = line.engine.stats.busy_s
+    line.run(600.0)
+    assert line.engine.stats.busy_s - used_s < 0.02 * 600

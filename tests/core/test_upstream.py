@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 
 from gateway.core.budget import line_budget
+from gateway.core.identity import Identity
 from gateway.core.requests import Lane
 from gateway.core.settings import PollSettings
 from gateway.core.site import Device, Outcome
 from gateway.core.snapshot import IDENTITY_MISMATCH, DeviceState
+from gateway.devices.plan import poll_plan
 from gateway.devices.schema import load_map
 from gateway.errors import IdentityUnproven, LineDown, RelayedSilence, ReplyTimeout
-from gateway.modbus.pdu import Function, ReadRequest
+from gateway.modbus.pdu import Function, ReadRequest, exception_reply
 from gateway.simulator.device import SimulatedController
 from gateway.simulator.plant import plants_of
 from gateway.simulator.upstream import Habits, SimulatedServer
@@ -328,6 +331,28 @@ def test_another_controller_behind_a_server_that_was_away_is_not_taken_for_the_o
     assert IDENTITY_MISMATCH in rig.devices[0].snapshot.warnings
     assert isinstance(rig.ask(0, registers(0, 10)), IdentityUnproven)
     assert rig.devices[0].snapshot.shown() == {}
+
+
+@pytest.mark.parametrize("latency_s", [0.05, 0.4])
+def test_what_is_under_way_when_another_controller_is_looked_at_again_ends_in_peace(latency_s: float) -> None:
+    """Its replies belong to a plan that is gone."""
+    prostar = load_map("prostar-mppt")
+
+    class Other(SimulatedController):
+        def handle(self, pdu: bytes, now: float) -> bytes | None:
+            return exception_reply(pdu[0], 2) if pdu[1:2] == b"\xe0" or pdu[0] == 1 else super().handle(pdu, now)
+
+    server = SimulatedServer([Other(prostar)], habits=Habits(latency_s=latency_s))
+    device = Device("array-1", 11, 1, prostar, expected=Identity(product="PS-MPPT-99"))
+    rig = make_upstream(server, [device], pipelining=8, poll=PollSettings(live_s=0.2, settings_s=1.0))
+    rig.run(600.0)
+    assert IDENTITY_MISMATCH in device.snapshot.warnings
+    server.stations[:] = [SimulatedController(prostar, plant=replace(plants_of(prostar)[0], product="PS-MPPT-99"))]
+    rig.run(70.0)
+    assert states(rig) == [DeviceState.ONLINE]
+    assert {(block.first, block.count) for block in device.snapshot.blocks} == {
+        (block.first, block.count) for block in poll_plan(prostar)
+    }
 
 
 def test_a_block_that_the_unit_does_not_have_may_be_under_way_when_it_tells_its_product() -> None:
