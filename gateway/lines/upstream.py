@@ -209,7 +209,7 @@ class UpstreamLine(LineShell):
         host, port = self._where.host, self._where.port
         with contextlib.suppress(ValueError):
             ip = ipaddress.ip_address(host)
-            if ip.version == 4:
+            if isinstance(ip, ipaddress.IPv4Address):
                 return [(socket.AF_INET, (host, port))]
             if ip.scope_id is None:
                 return [(socket.AF_INET6, (host, port, 0, 0))]

@@ -22,6 +22,7 @@ from gateway.errors import MapError
 from gateway.faces.snmp.layout import Layout, shipped_layout
 from gateway.faces.snmp.objects import Syntax
 from gateway.generate.mib import LOCK, lock, mib_outputs
+from tests.netsnmp import without_new_folders
 
 REPOSITORY = Path(__file__).parents[2]
 BASE = REPOSITORY / "mibs" / "base"
@@ -113,7 +114,7 @@ def test_net_snmp_loads_it_without_a_word(peer: Callable[[str], str], folder: Pa
         text=True,
         check=True,
     )
-    assert found.stderr == ""
+    assert without_new_folders(found.stderr) == ""
     assert found.stdout.strip().endswith(".1.2.1.4.1.9")
 
 
@@ -127,7 +128,7 @@ def test_net_snmp_loads_the_repositorys_folder_as_the_readme_says(peer: Callable
         text=True,
         check=True,
     )
-    assert (found.stderr, found.stdout) == ("", ".1.3.6.1.4.1.32473.1.1.2.1.1.1.0\n")
+    assert (without_new_folders(found.stderr), found.stdout) == ("", ".1.3.6.1.4.1.32473.1.1.2.1.1.1.0\n")
 
 
 @pytest.mark.peer
@@ -153,7 +154,7 @@ def test_what_every_agent_serves_and_sends_has_its_name(
         text=True,
         check=True,
     )
-    assert (found.stderr, found.stdout) == ("", f".{number}\n")
+    assert (without_new_folders(found.stderr), found.stdout) == ("", f".{number}\n")
 
 
 def test_pysmi_compiles_it(folder: Path) -> None:

@@ -15,6 +15,7 @@ from gateway.core.snapshot import DeviceState, Snapshot
 from gateway.core.stats import LineStats
 from gateway.devices.model import DeviceMap, Identification, Kind, Value
 from gateway.faces.snmp.agent import SnmpAgent
+from tests.netsnmp import without_new_folders
 
 REPOSITORY = Path(__file__).parents[3]
 NOW = 1000.0
@@ -144,4 +145,4 @@ async def run_tool(*command: str, environment: dict[str, str] | None = None) -> 
         await process.wait()
         raise
     assert process.returncode is not None
-    return process.returncode, output.decode()
+    return process.returncode, without_new_folders(output.decode())
