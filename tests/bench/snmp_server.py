@@ -12,7 +12,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import signal
-import socket
 import sys
 import time
 from dataclasses import replace
@@ -30,6 +29,7 @@ from gateway.faces.http.settings import HttpSettings
 from gateway.faces.modbus.server import ModbusServer
 from gateway.faces.modbus.settings import ModbusSettings
 from gateway.faces.snmp.agent import SnmpAgent
+from gateway.faces.snmp.datagrams import Datagrams
 from gateway.faces.snmp.secret import Secret
 from gateway.faces.snmp.settings import Community, SnmpSettings, User
 from gateway.faces.snmp.usm import Auth, Credentials, Priv
@@ -63,7 +63,7 @@ class Turns:
         self._answer_waiting = agent.answer_waiting
         self._longest_s = 0.0
 
-    def answer_waiting(self, sock: socket.socket, context: bytes = b"") -> None:
+    def answer_waiting(self, sock: Datagrams, context: bytes = b"") -> None:
         """One turn."""
         before = time.thread_time()
         self._answer_waiting(sock, context)

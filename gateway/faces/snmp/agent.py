@@ -4,7 +4,8 @@
    the socket are answered together, for at most TURN_S; then the others of the event loop have their turn. Modbus
    clients have it every SHARE_S (`give_way`).
 2. The sockets are bound by ourselves, so that a taken port is an error with a name. Before the first of them is bound,
-   the boots of this start are on disk (`engine.py`).
+   the boots of this start are on disk (`engine.py`). What listens everywhere answers from where it was asked
+   (`datagrams.py`).
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from gateway.faces.binding import bind_problem
 from gateway.faces.snmp import entity, standard
 from gateway.faces.snmp.client_rows import ClientRows
 from gateway.faces.snmp.counters import SnmpCounters
+from gateway.faces.snmp.datagrams import Datagrams, datagrams
 from gateway.faces.snmp.emc1 import context_of, emc1_tree
 from gateway.faces.snmp.engine import Engine, EngineLost, start_engine
 from gateway.faces.snmp.layout import Layout, shipped_layout
@@ -201,7 +203,7 @@ class SnmpAgent:
                 _log.exception("event=snmp_internal_error source=%s count=%d", host, count)
         return None
 
-    def answer_waiting(self, sock: socket.socket, context: bytes = b"") -> None:
+    def answer_waiting(self, sock: Datagrams, context: bytes = b"") -> None:
         """Answer what waits in the socket, for one turn."""
         quick, monotonic, receive, send = (
             self._responder.quick.answer,
@@ -304,12 +306,13 @@ class SnmpListener:
                 # One socket, one family: [::] and 0.0.0.0 can both be listed.
                 sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
             sock.bind(address)
+            waiting = datagrams(sock)
         except OSError as error:
             if sock is not None:
                 sock.close()
             raise ListenError(f"{self.label} (UDP): {bind_problem(error)}") from error
         self._socket = sock
-        loop.add_reader(sock, self._agent.answer_waiting, sock, self._context)
+        loop.add_reader(sock, self._agent.answer_waiting, waiting, self._context)
 
     async def stop(self) -> None:
         """Close the socket; a listener that is not started stays so."""

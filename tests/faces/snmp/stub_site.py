@@ -117,8 +117,8 @@ def stale(snapshot: Snapshot) -> Snapshot:
 
 
 @asynccontextmanager
-async def listening(agent: SnmpAgent) -> AsyncIterator[tuple[str, int]]:
-    listener = agent.listeners[0]
+async def listening(agent: SnmpAgent, number: int = 0) -> AsyncIterator[tuple[str, int]]:
+    listener = agent.listeners[number]
     await listener.start()
     try:
         assert listener.bound is not None

@@ -6,6 +6,7 @@ import asyncio
 import socket
 from collections.abc import Callable
 from dataclasses import replace
+from ipaddress import ip_network
 from itertools import pairwise
 from typing import cast
 
@@ -18,7 +19,8 @@ from gateway.faces.snmp.agent import SHARE_S, TURN_S, SnmpAgent
 from gateway.faces.snmp.layout import shipped_layout
 from gateway.faces.snmp.objects import RowKind
 from gateway.faces.snmp.quick import RUN
-from gateway.faces.snmp.settings import SnmpSettings
+from gateway.faces.snmp.settings import Community, Emc1Device, SnmpSettings
+from tests.cable import Cable
 from tests.faces.snmp.stub_site import StubClock, listening
 from tests.faces.snmp.test_responder import LIVE, LOCAL, SYS_DESCR, SYS_UP_TIME, Reply, request
 
@@ -93,6 +95,36 @@ async def test_both_families_share_a_port(make_agent: Callable[..., SnmpAgent]) 
             assert Reply(await exchange(("::1", port), request(v2c.GetRequestPDU, SYS_DESCR))).status == 0
             assert Reply(await exchange(("127.0.0.1", port), request(v2c.GetRequestPDU, SYS_DESCR))).status == 0
         assert second.counters.responses == agent.counters.responses == 1
+
+
+@pytest.mark.parametrize("number", [0, 1])
+async def test_who_asked_one_address_of_many_is_answered_from_it(
+    make_agent: Callable[..., SnmpAgent], number: int
+) -> None:
+    """What the kernel would answer from is another one, and to most askers, and every firewall, that is a stranger."""
+    everywhere = ("0.0.0.0", 0)
+    agent = make_agent(listen=(everywhere,), emc1=(Emc1Device(11, (everywhere,)),))
+    async with listening(agent, number) as (_, port):
+        for host in ("127.0.0.1", "127.0.0.2", "127.1.2.3"):
+            for _ in range(2):  # the second time it is answered from what is kept
+                assert Reply(await exchange((host, port), request(v2c.GetRequestPDU, SYS_DESCR))).status == 0
+    assert agent.counters.responses == 6
+
+
+@pytest.mark.parametrize("link_local", [False, True])
+async def test_over_ipv6_too(make_agent: Callable[..., SnmpAgent], cable: Cable, *, link_local: bool) -> None:
+    asked = "fe80::5047:1" if link_local else "fd50:4757::1"
+    cable.run("addr", "add", f"{asked}/64", "dev", cable.near, "nodad")
+    agent = make_agent(listen=(("::", 0),), communities=(Community("public", (ip_network("::/0"),)),))
+    async with listening(agent) as (_, port):
+        to = (asked, port, 0, socket.if_nametoindex(cable.near) if link_local else 0)
+        with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as asker:
+            asker.setblocking(False)
+            if not link_local:
+                asker.bind(("::1", 0))  # to which the kernel would answer from the same
+            asker.connect(to)
+            await asyncio.get_running_loop().sock_sendall(asker, request(v2c.GetRequestPDU, SYS_DESCR))
+            assert Reply(await asyncio.wait_for(asyncio.get_running_loop().sock_recv(asker, 2000), 5)).status == 0
 
 
 async def test_hostile_datagrams_do_not_stop_the_server(make_agent: Callable[..., SnmpAgent]) -> None:
