@@ -7,6 +7,7 @@ from start to signal is service/process.py's; how it comes to another configurat
 from __future__ import annotations
 
 import asyncio
+import ssl
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
@@ -54,6 +55,7 @@ class Plan:
     snmp: SnmpAgent | None  # None: as before
     days: LogKeeper | None  # what fills the agent's log table
     access: Access
+    https: ssl.SSLContext | None  # None: as before
     tls: Credentials | None
 
 
@@ -109,7 +111,7 @@ class Gateway:
             days = self._log_keeper(settings, self.config, south.site, history)
             agent = await asyncio.to_thread(self._agent, settings, south.site, conditions, days, self._snmp)
             access = self._http.access
-            await self.change(Plan(self.config, south, conditions, history, agent, days, access, tls=None))
+            await self.change(Plan(self.config, south, conditions, history, agent, days, access, https=None, tls=None))
 
     @property
     def lines(self) -> tuple[Line, ...]:
@@ -187,10 +189,10 @@ class Gateway:
 
     def _plan(self, config: Config, south: South, history: HistoryStats | None, conditions: Conditions) -> Plan:
         problems: list[str] = []
-        access, tls, agent, days = Access(), None, None, self._days
+        access, https, tls, agent, days = Access(), None, None, None, self._days
         try:
             access = Access.read(http_settings(config))
-            tls_context(http_settings(config))
+            https = tls_context(http_settings(config))
         except ListenError as error:
             problems.append(f"http: {error}")
         tls_wanted = tls_settings(config)
@@ -209,7 +211,7 @@ class Gateway:
                 agent = self._agent(settings, south.site, conditions, days, self._snmp)
         if problems:
             raise ConfigError(tuple(problems))
-        return Plan(config, south, conditions, history, agent, days, access, tls)
+        return Plan(config, south, conditions, history, agent, days, access, https, tls)
 
     async def change(self, plan: Plan) -> None:
         """Come to another configuration: a step that nobody sees half of; then what goes stops, what comes is tried."""
@@ -228,6 +230,7 @@ class Gateway:
             http_settings(config),
             plan.access,
             south.site,
+            tls=plan.https,
             history=plan.history,
             log=self._log(config),
             conditions=plan.conditions,

@@ -30,6 +30,7 @@ from gateway.service.settings import (
     modbus_settings,
 )
 from gateway.service.snmp import snmp_settings
+from tests.faces.http.test_access import certificate, written
 
 TEXT = """
 site = "ridge-07"
@@ -302,5 +303,20 @@ async def test_a_modbus_client_is_served_in_the_middle_of_an_snmp_turn() -> None
             gateway._snmp.answer_waiting(cast("socket.socket", Flood()))  # the loop has nothing to say in it
             reply = client.recv(64)
         assert (reply[:4], reply[6]) == (bytes.fromhex("0001 0000"), 0xFE)
+    finally:
+        await listener.stop()
+
+
+async def test_a_model_that_is_found_reads_no_file_of_https(tmp_path: Path) -> None:
+    """It comes when it comes: perhaps while somebody copies a new certificate, perhaps when no file can be read."""
+    crt, key = certificate(tmp_path)
+    text = f'tls_certificate = "{crt}"\ntls_private_key = "{key}"\n'
+    gateway = Gateway(parse_config(TEXT + text), SystemClock())
+    listener = gateway.listeners[-1]
+    await listener.start()
+    try:
+        written(tmp_path, "key", "not yet")
+        await gateway.show_models()
+        assert listener in gateway.listeners
     finally:
         await listener.stop()

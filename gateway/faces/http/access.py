@@ -5,7 +5,8 @@ Rule 1: without a file everybody may ask; with one or both, whoever shows any of
 Rule 2: what was shown is compared in constant time with every credential there is, as digests.
 Rule 3: a secret is in no message, and digests are all that is kept of it.
 Rule 4: files are read when a listener starts and when the configuration is read again; one that cannot be used keeps
-        the listener closed, or what was read before in use, and never opens to all.
+        the listener closed, or what was read before in use, and never opens to all. A TLS context is never loaded
+        again: one that met half of a renewed pair has neither certificate.
 """
 
 from __future__ import annotations
@@ -110,12 +111,6 @@ def tls_context(settings: HttpSettings) -> ssl.SSLContext | None:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
-    load_certificate(context, settings)
-    return context
-
-
-def load_certificate(context: ssl.SSLContext, settings: HttpSettings) -> None:
-    """Have new connections of the context get the certificate of the settings; ListenError as for `tls_context`."""
     for path in (settings.tls_certificate, settings.tls_private_key):
         _read(path)
     try:
@@ -127,6 +122,7 @@ def load_certificate(context: ssl.SSLContext, settings: HttpSettings) -> None:
             f"{settings.tls_certificate} and {settings.tls_private_key}: no certificate with its key in PEM form: "
             f"{str(reason).replace('_', ' ').lower()}"
         ) from None
+    return context
 
 
 def _read(path: str) -> bytes:

@@ -10,6 +10,7 @@ is dead is seen in `/metrics`.
 from __future__ import annotations
 
 import asyncio
+import ssl
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -101,6 +102,7 @@ class HttpFace:
         access: Access,
         site: Site,
         *,
+        tls: ssl.SSLContext | None,
         history: HistoryStats | None,
         log: DayLog | None,
         conditions: Conditions | None,
@@ -108,6 +110,7 @@ class HttpFace:
     ) -> None:
         """Go on by other settings, with the credentials that were read of them, for another site.
 
+        `tls` is what its certificate files were read into, None: they were not read, and those of before are in use.
         `listeners` are those that are wanted then: the same ones where address and kind are the same.
         """
         self._settings, self._access, self._site = settings, access, site
@@ -117,7 +120,7 @@ class HttpFace:
         self._log_api.adjust(site, log)
         self.listeners = self._listeners()
         for listener in self.listeners:
-            listener.adjust(settings)
+            listener.adjust(settings, tls)
 
     def _listeners(self) -> tuple[HttpListener, ...]:
         """The listeners of the settings; those that there are already are taken."""

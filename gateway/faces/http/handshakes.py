@@ -25,7 +25,7 @@ _NO_DESCRIPTORS = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 
 class Handshakes:
-    """A listening socket; `protocol` makes what serves a connection."""
+    """A listening socket; `protocol` makes what serves a connection. `most`, `timeout_s` and `tls` may be changed."""
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class Handshakes:
     ) -> None:
         self.most = most
         self.timeout_s = timeout_s
-        self._tls = tls
+        self.tls = tls
         self._stats = stats
         self._protocol = protocol
         self._sock: socket.socket | None = None
@@ -110,7 +110,7 @@ class Handshakes:
         self._pending[task] = None
         with suppress(OSError):  # TLS errors and time-outs are among them
             await asyncio.get_running_loop().connect_accepted_socket(
-                self._protocol, sock, ssl=self._tls, ssl_handshake_timeout=self.timeout_s
+                self._protocol, sock, ssl=self.tls, ssl_handshake_timeout=self.timeout_s
             )
 
     def _wait(self, sock: socket.socket) -> None:

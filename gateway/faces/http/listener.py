@@ -13,7 +13,7 @@ from collections.abc import Callable
 from gateway.clock import Clock
 from gateway.errors import ListenError
 from gateway.faces.binding import BACKLOG, bind_problem, listening_socket
-from gateway.faces.http.access import load_certificate, tls_context
+from gateway.faces.http.access import tls_context
 from gateway.faces.http.connection import Connections
 from gateway.faces.http.handshakes import Handshakes
 from gateway.faces.http.own import HttpStats
@@ -45,7 +45,6 @@ class HttpListener:
         self._connections: Connections | None = None
         self._server: asyncio.Server | None = None
         self._handshakes: Handshakes | None = None  # with TLS, instead of a server
-        self._tls: ssl.SSLContext | None = None
         self.key = (host, port, bool(settings.tls_certificate))
         """Two listeners that agree in this are the same."""
 
@@ -67,7 +66,6 @@ class HttpListener:
             handler, tls = self._handler(), tls_context(self._settings)
         except ListenError as error:
             raise ListenError(f"{self.label}: {error}") from None
-        self._tls = tls
         self._connections = connections = Connections(self._settings, handler, self._clock, self._stats)
         try:
             if tls is None:
@@ -83,15 +81,14 @@ class HttpListener:
             await self.stop()
             raise
 
-    def adjust(self, settings: HttpSettings) -> None:
-        """Go on by other settings, with what the certificate files hold now; ListenError when they are of no use."""
+    def adjust(self, settings: HttpSettings, tls: ssl.SSLContext | None) -> None:
+        """Go on by other settings; `tls` is for the handshakes from now on, None: that of before."""
         self._settings = settings
         if self._connections is not None:
             self._connections.settings = settings
         if self._handshakes is not None:
             self._handshakes.most, self._handshakes.timeout_s = settings.max_connections, settings.idle_timeout_s
-        if self._tls is not None:
-            load_certificate(self._tls, settings)
+            self._handshakes.tls = tls or self._handshakes.tls
 
     async def stop(self) -> None:
         """Stop listening and close every connection; replies under way have `stop_grace_s`."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import logging
+import shutil
 import ssl
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
@@ -256,3 +258,41 @@ async def test_a_certificate_that_cannot_be_used_is_named(
     ) as told:
         await listener.start()
     assert "hunter2" not in str(told.value)
+
+
+async def shown_certificate(gateway: Gateway) -> bytes:
+    """What a new connection is shown, as DER."""
+    trusting = ssl.create_default_context()
+    trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
+    host, port = gateway.url.removeprefix("http://").split(":")
+    _, writer = await asyncio.open_connection(host, int(port), ssl=trusting)
+    shown = writer.get_extra_info("ssl_object").getpeercert(binary_form=True)
+    writer.close()
+    assert isinstance(shown, bytes)
+    return shown
+
+
+@pytest.mark.parametrize("renewed", ["crt", "key"])
+async def test_files_are_read_when_that_is_asked_for_and_not_before(
+    make_gateway: MakeGateway, tmp_path: Path, renewed: str
+) -> None:
+    """Half of a renewed pair on disk, while the face goes on by other settings for another reason, costs nothing."""
+    crt, key = certificate(tmp_path)
+    (tmp_path / "second").mkdir()
+    other = dict(zip(("crt", "key"), certificate(tmp_path / "second"), strict=True))
+    gateway = make_gateway(tls_certificate=crt, tls_private_key=key)
+    settings = HttpSettings((("127.0.0.1", 0),), tls_certificate=crt, tls_private_key=key)
+
+    def adjust(tls: ssl.SSLContext | None) -> None:
+        nothing: dict[str, None] = dict.fromkeys(("history", "log", "conditions"))
+        gateway.face.adjust(settings, Access(), gateway.site, tls=tls, notifications=(), **nothing)
+
+    async with gateway.running():
+        first = await shown_certificate(gateway)
+        shutil.copy(other[renewed], tmp_path / renewed)
+        adjust(None)
+        assert await shown_certificate(gateway) == first
+        for name, path in other.items():
+            shutil.copy(path, tmp_path / name)
+        adjust(tls_context(settings))
+        assert await shown_certificate(gateway) != first
