@@ -136,6 +136,8 @@ class Security:
         asker, message_id, plain = found
         if asker.user.name not in usable or not self._timely(asker.time, now):
             return None
+        if len(plain) < 2:
+            return None
         size = plain[1]
         start = 2 if size < 0x80 else size - 0x7E
         scope = self._scope

@@ -79,11 +79,11 @@ def parse(data: bytes, at: int) -> Message:
     message.message_id = data[first:at]
     message.max_size, at = integer(data, at, body)
     start, at = content(data, at, body, 0x04)
-    message.flags = data[start]
-    size = at - start
+    flags = data[start:at]
     message.model, at = integer(data, at, body)
-    if size != 1 or at != body or number < 0 or message.max_size < MIN_MAX_SIZE or message.model < 1:
+    if len(flags) != 1 or at != body or number < 0 or message.max_size < MIN_MAX_SIZE or message.model < 1:
         raise NotSnmp("msgGlobalData")
+    message.flags = flags[0]
     if message.model != USER_BASED:
         return message
     start, after = content(data, body, end, 0x04)

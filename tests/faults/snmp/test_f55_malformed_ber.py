@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pysnmp.proto.api import v2c
 
+from gateway.faces.snmp import reader, v3, wire
 from gateway.faces.snmp.agent import SnmpAgent
 from gateway.faces.snmp.settings import REPLY_LIMIT
 from tests.faces.snmp.poller import AUTH_PRIV, Poller, a_user, pdu
@@ -104,6 +105,22 @@ def test_hostile_datagrams_end_in_one_counter(spoken: SnmpAgent, caplog: pytest.
     assert counters.internal_errors == 0
     assert sum("reason=malformed" in record.getMessage() for record in caplog.records) == 1
     assert spoken.answer(request(v2c.GetRequestPDU, SYS_DESCR), LOCAL) is not None
+
+
+def test_a_message_without_flags_is_malformed(spoken: SnmpAgent) -> None:
+    header = tlv(0x30, wire.integer(0x02, 1) + wire.integer(0x02, 1472) + tlv(0x04, b""))
+    assert spoken.answer(tlv(0x30, wire.integer(0x02, reader.VERSION_3) + header), LOCAL) is None
+    assert (spoken.counters.parse_errors, spoken.counters.internal_errors) == (1, 0)
+
+
+@pytest.mark.parametrize("size", [0, 1, 2, 3])
+def test_what_a_known_asker_encrypts_may_be_short(spoken: SnmpAgent, size: int) -> None:
+    poller = signed_in(spoken)
+    assert poller.ask(v2c.GetRequestPDU, SYS_DESCR) is not None  # from now on it is known
+    message_id = wire.integer(0x02, poller.message_id + 1)
+    data = v3.Sealer(poller.user).seal(poller.authority, message_id, AUTH_PRIV, b"\x30\x01\x04"[:size])
+    assert spoken.answer(data, LOCAL) is not None  # the report
+    assert (spoken.counters.decryption_errors, spoken.counters.internal_errors) == (1, 0)
 
 
 @hostile
