@@ -206,7 +206,7 @@ class Connection(asyncio.Protocol):
             return
         self._stop_timer()
         if isinstance(found, Refusal):
-            self._last = True
+            self._last, self._head_only = True, False
             self._buffer.clear()
             self._answer(Reply(found.status, f"{found.text}\n".encode()))
             self._close()

@@ -95,6 +95,13 @@ async def test_head_has_no_body_and_the_connection_goes_on(gateway: Gateway, pat
     assert second.startswith(b"HTTP/1.1 200 OK")
 
 
+async def test_what_is_refused_behind_a_head_has_a_body(gateway: Gateway) -> None:
+    reply = await talk(gateway, get("/healthz", method="HEAD") + b"no HTTP\r\n\r\n")
+    refused = reply[reply.index(b"HTTP/1.1 400") :]
+    assert b"Content-Length: 28\r\n" in refused
+    assert refused.endswith(b"\r\n\r\nno request line of HTTP/1.1\n")
+
+
 @pytest.mark.parametrize(
     ("method", "field", "status"),
     [("POST", "Content-Length: 40", b"405"), ("GET", "Transfer-Encoding: chunked", b"413")],
