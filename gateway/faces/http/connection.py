@@ -4,7 +4,8 @@ Rule 1: who sends no whole head within `idle_timeout_s`, or no further request, 
         reply to the end within `send_timeout_s`.
 Rule 2: at most `max_connections` are kept. When one more comes, the one that has been open longest and has no request
         under way makes room. Where all have one, as many more are let in three times over, and no more than that.
-Rule 3: while a request is under way nothing more is read than one further head.
+Rule 3: while a request is under way nothing more is read than one further head. A head that comes in pieces is looked
+        at when its end has come, and else not before it is twice as long as it was.
 Rule 4: a handler that fails costs its own connection: 500, counted and logged.
 """
 
@@ -20,7 +21,7 @@ from gateway.clock import Clock
 from gateway.faces.http.own import HttpStats
 from gateway.faces.http.request import Handler, Reply, Request
 from gateway.faces.http.settings import HttpSettings
-from gateway.faces.http.wire import HEAD_BYTES, LAST_CHUNK, Fields, Head, Refusal, chunk, reply_head, take
+from gateway.faces.http.wire import HEAD_BYTES, LAST_CHUNK, Fields, Head, Refusal, chunk, ends, reply_head, take
 
 BUSY_FACTOR = 4
 """So many times `max_connections` there can be while each of them has a request under way."""
@@ -87,6 +88,7 @@ class Connection(asyncio.Protocol):
         self._transport: asyncio.Transport | None = None
         self.aborted = False  # it ends in a later turn of the loop
         self._buffer = bytearray()
+        self._enough = 0  # bytes in it with which it is looked at though no head ends there
         self._timer: asyncio.TimerHandle | None = None
         self._task: asyncio.Task[None] | None = None  # the request under way
         self._room: asyncio.Future[None] | None = None  # somebody waits until more can be sent
@@ -133,7 +135,8 @@ class Connection(asyncio.Protocol):
         """See `asyncio.Protocol`."""
         self._buffer += data
         if self._task is None:
-            self._next()
+            if len(self._buffer) >= self._enough or ends(self._buffer, len(data)):
+                self._next()
         elif len(self._buffer) >= HEAD_BYTES and self._transport is not None:  # rule 3
             self._transport.pause_reading()
 
@@ -202,6 +205,7 @@ class Connection(asyncio.Protocol):
     def _next(self) -> None:
         """Begin the next request, if it is there."""
         found = take(self._buffer)
+        self._enough = min(2 * len(self._buffer), HEAD_BYTES)
         if found is None or self._transport is None:
             return
         self._stop_timer()

@@ -4,7 +4,7 @@ Rule 1: a request has no body here. One that announces a body is answered, and i
         is ever read as a request that was sent as something else.
 Rule 2: lines end in CR LF and nothing else; no field is folded, none is there twice of which there can be one only.
 Rule 3: a head is at most `HEAD_BYTES` long and has at most `FIELDS` fields. What cannot become a request is refused
-        as soon as it is seen, not when its end has come.
+        when it is looked at, not only when its end has come.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ Fields = Iterable[tuple[str, str]]
 """Header fields of a reply; names and values are ours, without CR and LF."""
 
 _END = b"\r\n\r\n"
+_EMPTY_LINES = re.compile(rb"(?:\r\n)+")
 _TOKEN = rb"[!#$%&'*+.^_`|~0-9A-Za-z-]+"
 _METHOD_BEGINS = re.compile(rb"[!#$%&'*+.^_`|~0-9A-Za-z-]")
 _REQUEST_LINE = re.compile(rb"(" + _TOKEN + rb") ([\x21-\x7e]+) HTTP/([0-9])\.([0-9])")
@@ -70,12 +71,20 @@ class _NoRequestError(GatewayError):
 
 def take(buffer: bytearray) -> Head | Refusal | None:
     """The next request, taken from the front of the buffer; None as long as its end has not come."""
-    while buffer.startswith(b"\r\n"):  # RFC 9112 §2.2
-        del buffer[:2]
+    empty = _EMPTY_LINES.match(buffer)  # RFC 9112 §2.2
+    if empty is not None:
+        del buffer[: empty.end()]
+    if not buffer or buffer == b"\r":
+        return None
     try:
-        return _take(buffer) if buffer else None
+        return _take(buffer)
     except _NoRequestError as error:
         return error.refusal
+
+
+def ends(buffer: bytearray, new: int) -> bool:
+    """Whether a head ends in the last `new` bytes of the buffer."""
+    return buffer.find(_END, max(0, len(buffer) - new - len(_END) + 1)) >= 0
 
 
 def _take(buffer: bytearray) -> Head | None:

@@ -11,9 +11,10 @@ from contextlib import asynccontextmanager
 
 import pytest
 
+from gateway.faces.http import connection as connection_module
 from gateway.faces.http.connection import BUSY_FACTOR
 from gateway.faces.http.request import Reply, Request
-from gateway.faces.http.wire import HEAD_BYTES
+from gateway.faces.http.wire import HEAD_BYTES, Head, Refusal, take
 
 from .conftest import Gateway
 from .test_listener import still_open, strangers
@@ -100,6 +101,32 @@ async def test_what_is_refused_behind_a_head_has_a_body(gateway: Gateway) -> Non
     refused = reply[reply.index(b"HTTP/1.1 400") :]
     assert b"Content-Length: 28\r\n" in refused
     assert refused.endswith(b"\r\n\r\nno request line of HTTP/1.1\n")
+
+
+async def test_a_head_in_ever_so_many_pieces_is_read_a_few_times(
+    gateway: Gateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looks = 0
+
+    def counted(buffer: bytearray) -> Head | Refusal | None:
+        nonlocal looks
+        looks += 1
+        return take(buffer)
+
+    monkeypatch.setattr(connection_module, "take", counted)
+    head = get("/healthz", f"Field: {'x' * HEAD_BYTES}")
+    bound = gateway.face.listeners[0].bound
+    assert bound is not None
+    reader, writer = await asyncio.open_connection(*bound)
+    writer.get_extra_info("socket").setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    for at in range(HEAD_BYTES):
+        writer.write(head[at : at + 1])
+        await asyncio.sleep(0)
+    async with asyncio.timeout(10):
+        reply = await reader.read()
+    writer.close()
+    assert reply.startswith(b"HTTP/1.1 431")
+    assert looks <= 2 * HEAD_BYTES.bit_length()
 
 
 @pytest.mark.parametrize(

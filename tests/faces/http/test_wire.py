@@ -113,10 +113,10 @@ def test_any_bytes_are_a_request_a_refusal_or_a_part(data: bytes) -> None:
         assert not set("\r\n\0") & set("".join(found.fields.values()))
 
 
-@given(st.lists(st.binary(min_size=1, max_size=20)), st.data())
-def test_pieces_make_no_difference(extra: list[bytes], draw: st.DataObject) -> None:
+@given(st.integers(0, 2), st.lists(st.binary(min_size=1, max_size=20)), st.data())
+def test_pieces_make_no_difference(empty: int, extra: list[bytes], draw: st.DataObject) -> None:
     fields = b"".join(b"X-%d: %s\r\n" % (number, text) for number, text in enumerate(extra))
-    data = GET + fields + b"\r\n"
+    data = b"\r\n" * empty + GET + fields + b"\r\n"
     whole = take(bytearray(data))
     buffer = bytearray()
     cut = draw.draw(st.integers(0, len(data)))
