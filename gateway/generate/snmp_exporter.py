@@ -37,7 +37,7 @@ _UNIT_WORDS = {"h": "hours", "d": "days"}
 _HUNDREDTHS = "hundredths of a second"
 
 _MARK = "# Made by `prostar-gateway generate` from the device maps. Do not edit.\n"
-_NEW = "# For snmp_exporter 0.23 and later; set the community or the pass phrases below.\n"
+_NEW = "# For snmp_exporter 0.23 and later, such as Debian 13's; set the community or the pass phrases below.\n"
 _OLD = "# For snmp_exporter 0.21 and 0.22, such as Debian 12's; set the community in both modules.\n"
 
 

@@ -18,7 +18,11 @@ _TEXT = """\
 #   name = "CHANGE-ME"
 #   source = ["127.0.0.1/32"]
 #
-# An access view of snmpd that names subtrees has to name these too.
+# An access view of snmpd that names subtrees has to name these too. Debian's own is one:
+#
+#   view systemonly included .{root}
+#   view systemonly included .{entity}
+#   view systemonly included .{sensors}
 
 # snmp.enterprise_root
 proxy -v 2c -c CHANGE-ME 127.0.0.1:1161 .{root}

@@ -22,6 +22,11 @@ TTY = f"{PORT}/tty/ttyUSB0"
 BRLTTY = 'SUBSYSTEM=="usb", ENV{PRODUCT}=="403/6001/*", TAG+="systemd", ENV{SYSTEMD_WANTS}+="brltty-udev.service"\n'
 """What brltty's rules come down to for an adapter that they take for a braille display."""
 
+NOT_WRITTEN = "Running in test mode, skipping writing ATTR"
+"""What a udevadm 257 (Debian 13) says of an attribute; 252 (Debian 12) says that it writes it, and does not."""
+DONE = f"ATTR|LINK|Added SYMLINK|{NOT_WRITTEN}"
+"""How both begin to say what a rule did."""
+
 Udev = Callable[..., str]
 
 pytestmark = pytest.mark.peer
@@ -53,12 +58,12 @@ def udev(peer: Callable[[str], str], tmp_path: Path) -> Udev:
 
 
 def properties(shown: str) -> dict[str, str]:
-    return dict(re.findall(r"^([A-Z]\w*)=(.*)$", shown, re.MULTILINE))
+    return dict(re.findall(r"^ *([A-Z]\w*)=(.*)$", shown, re.MULTILINE))
 
 
 def complaints(shown: str) -> list[str]:
     """What udev says about the rules themselves."""
-    return [line for line in shown.splitlines() if re.search(rf"{RULES.name}:\d+ (?!ATTR|LINK)", line)]
+    return [line for line in shown.splitlines() if re.search(rf"{RULES.name}:\d+ (?!{DONE})", line)]
 
 
 def named() -> str:
@@ -91,7 +96,9 @@ def test_brltty_is_kept_away(udev: Udev) -> None:
 
 
 def test_an_ftdi_adapter_hands_on_at_once_what_it_received(udev: Udev) -> None:
-    assert f"ATTR '{PORT}/latency_timer' writing '1'" in udev(PORT, RULES.read_text())
+    shown = udev(PORT, RULES.read_text())
+    attribute = f"{PORT}/latency_timer"
+    assert f"ATTR '{attribute}' writing '1'" in shown or f'{NOT_WRITTEN}{{{attribute}}}="1".' in shown
 
 
 @pytest.mark.parametrize("name", ["prostar-shelter-a", "prostar-shelter-b"], ids=["by serial number", "by socket"])

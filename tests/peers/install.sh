@@ -140,7 +140,8 @@ fi
 if [[ -d /run/systemd/system ]]; then
   for package in "${missing[@]}"; do
     case $package in
-      prometheus | prometheus-snmp-exporter | snmpd | snmptrapd | ser2net) "${root[@]}" systemctl disable --now --quiet "$package.service" || true ;;
+      prometheus | prometheus-snmp-exporter | snmpd | ser2net) "${root[@]}" systemctl disable --now --quiet "$package.service" || true ;;
+      snmptrapd) "${root[@]}" systemctl disable --now --quiet snmptrapd.service snmptrapd.socket || true ;;
     esac
   done
 fi

@@ -1,14 +1,18 @@
-"""Debian's own snmp_exporter scrapes an agent by the delivered file: names, units and labels are those of /metrics."""
+"""Debian's own snmp_exporter scrapes an agent by the delivered file: names, units and labels are those of /metrics.
+
+The file is the one that the page names for the version that is installed: Debian 12 has 0.21, Debian 13 has 0.28.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import re
+import subprocess
 import urllib.error
 import urllib.request
 from collections.abc import AsyncIterator, Awaitable, Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -23,6 +27,8 @@ from tests.faces.snmp.stub_site import stale
 
 MODULES = ("prostar_gateway", "prostar_gateway_settings")
 OLD, NEW = "snmp_exporter/snmp-debian12.yml", "snmp_exporter/snmp.yml"
+CREDENTIALS_APART = (0, 23)
+"""From this version on credentials stand beside the modules, and a query names them."""
 
 Series = dict[tuple[str, frozenset[tuple[str, str]]], float]
 Scrape = Callable[[str], Awaitable[Series]]
@@ -55,20 +61,45 @@ async def get(url: str) -> str:
     return await asyncio.to_thread(read)
 
 
+@dataclass(frozen=True)
+class Installed:
+    """The exporter of this machine, and the delivered file that is for it."""
+
+    program: str
+    file: str
+    query: str
+
+    @property
+    def query_v3(self) -> str:
+        """As `query`, for the SNMPv3 user."""
+        return self.query.replace("_v2c", "_v3")
+
+
+@pytest.fixture
+def installed(peer: Callable[[str], str]) -> Installed:
+    program = peer("prometheus-snmp-exporter")
+    told = subprocess.run([program, "--version"], capture_output=True, text=True, check=True)
+    version = re.match(r"snmp_exporter, version (\d+)\.(\d+)", told.stdout + told.stderr)
+    assert version is not None, told
+    if (int(version[1]), int(version[2])) < CREDENTIALS_APART:
+        return Installed(program, OLD, "")
+    return Installed(program, NEW, "&auth=prostar_v2c")
+
+
 @pytest.fixture
 async def exporter(
-    peer: Callable[[str], str], delivered: Callable[[str], str], tmp_path: Path, free_tcp_port: Callable[[], int]
+    installed: Installed, delivered: Callable[[str], str], tmp_path: Path, free_tcp_port: Callable[[], int]
 ) -> AsyncIterator[Callable[[str], Awaitable[str]]]:
     """`await exporter(config)` starts one and gives its URL; the default is what is delivered, with the community."""
     running: list[asyncio.subprocess.Process] = []
 
     async def start(config: str = "") -> str:
         path = tmp_path / "snmp.yml"
-        path.write_text(config or delivered(OLD).replace("CHANGE-ME", COMMUNITY), encoding="utf-8")
+        path.write_text(config or delivered(installed.file).replace("CHANGE-ME", COMMUNITY), encoding="utf-8")
         port = free_tcp_port()
         running.append(
             await asyncio.create_subprocess_exec(
-                peer("prometheus-snmp-exporter"),
+                installed.program,
                 f"--config.file={path}",
                 f"--web.listen-address=127.0.0.1:{port}",
                 stderr=asyncio.subprocess.DEVNULL,
@@ -88,13 +119,13 @@ async def exporter(
 
 
 @pytest.fixture
-async def scrape(plant: Plant, exporter: Callable[..., Awaitable[str]]) -> Scrape:
+async def scrape(plant: Plant, installed: Installed, exporter: Callable[..., Awaitable[str]]) -> Scrape:
     url = await exporter()
-    return lambda module: scraped(url, module, plant)
+    return lambda module: scraped(url, module + installed.query, plant)
 
 
 async def scraped(url: str, module: str, plant: Plant) -> Series:
-    return series(await get(f"{url}/snmp?module={module}&target=127.0.0.1:{plant.port}"))
+    return series(await get(f"{url}/snmp?target=127.0.0.1:{plant.port}&module={module}"))
 
 
 def shown_points(device: Device, *, settings: bool) -> list[Point]:
@@ -189,17 +220,21 @@ async def test_any_number_is_shifted_right(scrape: Scrape, plant: Plant, value: 
 
 @pytest.mark.peer
 async def test_it_scrapes_with_snmpv3_too(
-    plant: Plant, exporter: Callable[..., Awaitable[str]], delivered: Callable[[str], str]
+    plant: Plant, installed: Installed, exporter: Callable[..., Awaitable[str]], delivered: Callable[[str], str]
 ) -> None:
-    """The credentials of the newer form, written as this version wants them."""
+    """The credentials of the newer form; an exporter before it has them in its module, written the same."""
     [auth] = re.findall(r"^  prostar_v3:\n((?:    .*\n)+)", delivered(NEW), re.MULTILINE)
     assert "version: 3" in auth
-    secured = auth.replace("    version: 3\n", "").replace('password: "CHANGE-ME"', f'password: "{AUTH_PHRASE}"', 1)
+    secured = auth.replace('password: "CHANGE-ME"', f'password: "{AUTH_PHRASE}"', 1)
     secured = secured.replace('"CHANGE-ME"', f'"{PRIV_PHRASE}"')
-    old = '  version: 2\n  auth:\n    community: "CHANGE-ME"\n'
-    assert delivered(OLD).count(old) == len(MODULES)
-    url = await exporter(delivered(OLD).replace(old, f"  version: 3\n  auth:\n{secured}"))
-    found = await scraped(url, MODULES[0], plant)
+    config = delivered(NEW).replace(auth, secured)
+    if installed.file == OLD:
+        old = '  version: 2\n  auth:\n    community: "CHANGE-ME"\n'
+        assert delivered(OLD).count(old) == len(MODULES)
+        in_module = "  version: 3\n  auth:\n" + secured.replace("    version: 3\n", "")
+        config = delivered(OLD).replace(old, in_module)
+    url = await exporter(config)
+    found = await scraped(url, MODULES[0] + installed.query_v3, plant)
     assert ("morningstar_battery_voltage_volts", of(plant.online[0])) in found
 
 
