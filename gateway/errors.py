@@ -156,6 +156,12 @@ class DeviceSilent(RequestError):
     label = "silent"
 
 
+class Unconfirmed(DeviceSilent):
+    """A write was, or may have been, sent, and nobody could find out what became of it."""
+
+    label = "unconfirmed"
+
+
 class ReplyTimeout(DeviceSilent):
     """No complete reply within the time-out, after all retries."""
 

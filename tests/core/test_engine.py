@@ -475,6 +475,26 @@ def test_what_a_stopping_line_cannot_end_is_refused_as_the_rest(virtual_line: Ma
     assert [type(outcome) for outcome in outcomes] == [ShuttingDown]
 
 
+def test_a_write_that_was_sent_is_never_said_not_to_be(virtual_line: MakeLine) -> None:
+    """The line stops, and cannot wait until it is answered: 06 would say that nothing was done."""
+    station = Registers(1)
+    line = virtual_line(station, reply_timeout_s=10.0, writes=True)
+    line.run(10.0)
+    station.silent = True
+    write, later = bytes.fromhex("06 E000 1234"), bytes.fromhex("06 E001 1234")
+    outcomes: list[Outcome] = []
+    line.write(line.devices[0], write, outcomes.append)
+    while not any(frame[1:-2] == write for _, frame in line.sent):
+        line.run(0.01)
+    line.write(line.devices[0], later, outcomes.append)
+    line.engine.finish()
+    line.run(0.01)
+    line.engine.closed("stopped", line.now)
+    line.run(0.01)
+    assert [type(outcome) for outcome in outcomes] == [ShuttingDown, LineDown]
+    assert not any(frame[1:-2] == later for _, frame in line.sent)
+
+
 def test_a_line_that_stops_repeats_nothing(virtual_line: MakeLine) -> None:
     station = Registers(1)
     line = virtual_line(station)

@@ -25,8 +25,11 @@ from gateway.errors import (
     IllegalFunction,
     LedgerUnavailable,
     LineDown,
+    QueueFull,
     ReplyCrcError,
     ReplyTimeout,
+    ShuttingDown,
+    Unconfirmed,
     WriteBudgetSpent,
     WriteDiffers,
     WriteTooSoon,
@@ -263,6 +266,15 @@ def test_a_write_that_cannot_be_read_back_is_unknown(bench: Bench) -> None:
     bench.faults[2] = ReplyTimeout()
     result = bench.write("06 E000 4B64")
     assert isinstance(result.outcome, ReplyTimeout)
+    assert bench.fates() == [Fate.UNKNOWN]
+
+
+@pytest.mark.parametrize("why", [QueueFull("array-1"), ShuttingDown(), b"\x83\x06"], ids=["full", "stopping", "busy"])
+def test_a_write_that_cannot_be_read_back_for_now_is_0b_and_never_06(bench: Bench, why: Outcome) -> None:
+    bench.faults[2] = why
+    result = bench.write("06 E000 4B64")
+    assert isinstance(result.outcome, Unconfirmed)
+    assert result.outcome.exception_code == 0x0B
     assert bench.fates() == [Fate.UNKNOWN]
 
 

@@ -242,14 +242,14 @@ class Connection(asyncio.Protocol):
         self._guarded(self._refuse_the_rest)
 
     def give_up(self) -> None:
-        """Wait no longer for what is under way: answer 06 to it, and close."""
+        """Wait no longer for what is under way: answer 06 to it (to a write that has begun 0B), and close."""
         for due in self._due:
+            if due.waiting is not None and due.reply is None:
+                unit, pdu = due.waiting.unit, due.waiting.pdu
+                due.reply = self._dispatcher.refuse(unit, pdu, self.client, due.waiting.given_up(due.ticket))
             if due.ticket is not None:
                 due.ticket.cancel()
                 due.ticket = None
-            if due.waiting is not None and due.reply is None:
-                unit, pdu = due.waiting.unit, due.waiting.pdu
-                due.reply = self._dispatcher.refuse(unit, pdu, self.client, ShuttingDown())
         self._guarded(self._send_due)
         self._guarded(self._settle)
 

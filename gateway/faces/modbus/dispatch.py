@@ -26,7 +26,7 @@ from gateway.core.status_registers import FUNCTIONS, StatusRegisters
 from gateway.core.status_registers import UNIT as STATUS_UNIT
 from gateway.core.write_rules import Requester
 from gateway.core.writing import Job
-from gateway.errors import IllegalFunction, RateLimited, RequestError, UnitNotRouted
+from gateway.errors import IllegalFunction, RateLimited, RequestError, ShuttingDown, UnitNotRouted
 from gateway.faces.modbus.hot import HotReplies
 from gateway.faces.modbus.settings import ModbusSettings
 from gateway.faces.modbus.writer import Writer
@@ -61,6 +61,12 @@ class Forward(NamedTuple):
         device = self.serving.device
         return device.line.read(device, self.ask.pdu, done, client=client)
 
+    @staticmethod
+    def given_up(ticket: Ticket | None) -> RequestError:
+        """What its client is told when nobody can wait for the answer any longer."""
+        del ticket  # whether it was sent makes no difference
+        return ShuttingDown()
+
     def concluded(self, outcome: Outcome) -> None:
         """The line has answered, perhaps after its client left."""
         self.serving.learn(self.ask, outcome)
@@ -84,6 +90,10 @@ class WriteOrder:
         """Have it done; `done` as for `LinePort.write`."""
         del client  # the job knows who asked
         return self.writer.submit(self.job, done, self.serving.forget)
+
+    def given_up(self, ticket: Ticket | None) -> RequestError:
+        """See `Forward.given_up`."""
+        return self.writer.given_up(ticket)
 
     def concluded(self, outcome: Outcome) -> None:
         """A write teaches nothing: what it wrote is read again."""

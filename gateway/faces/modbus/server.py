@@ -5,7 +5,8 @@ Rule 2: who gets in, and who makes room, is decided by admission.py.
 Rule 3: once a second every connection is asked whether it should end (idle, half a request, a client that
         takes no replies, a request nobody answers); the hot path sets no timers.
 Rule 4: a listener that stops takes no more connections, answers 06 to what it has not begun, waits `stop_grace_s` for
-        what is under way, answers 06 to the rest of it, and closes; who does not take that is cut off.
+        what is under way, answers 06 to the rest of it (0B to a write that has begun: nobody knows), and closes; who
+        does not take that is cut off.
 """
 
 from __future__ import annotations

@@ -44,6 +44,8 @@ from gateway.errors import (
     LedgerUnavailable,
     QueueFull,
     RequestError,
+    ShuttingDown,
+    Unconfirmed,
     WriteBudgetSpent,
     WriteTooSoon,
 )
@@ -66,6 +68,7 @@ class _Order:
         self.job = job
         self.done: Callable[[Outcome], None] | None = done
         self.forget = forget
+        self.begun = False
 
     def cancel(self, keep: Callable[[Outcome], None] | None = None) -> None:
         """See `core.site.Ticket`; a write leaves nothing to keep."""
@@ -154,12 +157,19 @@ class Writer:
         assert self._loop is not None, "started first"
         order = _Order(job, done, forget)
         if job.slave_control:
+            order.begun = True
             run = self._run_of(order, self._slave.perform(job, self._moment()), self._done_with_control)
             self._step(run, None, late=True)
         else:
             self._waiting[job.device.unit_id].append(order)
             self._loop.call_soon(self._next, job.device.unit_id)
         return order
+
+    @staticmethod
+    def given_up(ticket: object) -> RequestError:
+        """What an asker is told for whom nobody can wait any longer."""
+        begun = isinstance(ticket, _Order) and ticket.begun
+        return Unconfirmed("given up") if begun else ShuttingDown()
 
     # One device's writes, one after another
 
@@ -181,6 +191,7 @@ class Writer:
         elif waiting:
             self._running.add(unit)
             order = waiting.popleft()
+            order.begun = True
             run = self._run_of(order, perform(order.job, self._wear, self._moment()), self._done_with_job)
             self._step(run, None)
 

@@ -23,16 +23,18 @@ QUIET = "[poll]\nlive_s = 3600.0\nsettings_s = 3600.0\n[cache]\nmax_age_s = 0.1\
 
 
 class Unit(OracleController):
-    """A controller that notes what it is asked."""
+    """A controller that notes what it is asked, and may do one thing without saying so."""
 
     def __init__(self, number: int, address: int) -> None:
         super().__init__(load_map("prostar-mppt"), device=number, address=address)
         self.asked: list[bytes] = []
+        self.never_answered = b""
 
     def handle(self, pdu: bytes, now: float) -> bytes | None:
         """See `Controller.handle`."""
         self.asked.append(pdu)
-        return super().handle(pdu, now)
+        reply = super().handle(pdu, now)
+        return None if pdu == self.never_answered else reply
 
     async def is_asked(self, pdu: bytes) -> None:
         """Wait until this is on the wire."""

@@ -12,6 +12,9 @@ from collections.abc import Callable
 
 import pytest
 
+from gateway.core.write_ledger import Fate, entries
+from gateway.devices.schema import load_map
+from gateway.faces.modbus.ledger import read_ledger
 from gateway.service.settings import STOP_GRACE_S
 from tests.faces.modbus.tls.conftest import pki
 from tests.faces.modbus.tls.site import Pki
@@ -30,10 +33,9 @@ async def test_the_wire_is_waited_for_the_queue_is_06_and_nobody_new_gets_in(ser
     async with client(service.modbus) as on_the_wire, client(service.modbus) as waits, client(service.modbus) as idle:
         on_the_wire.ask(11, read(0xE000, 2))
         await unit.is_asked(read(0xE000, 2))
-        await asyncio.sleep(0.15)  # what was polled is older than max_age_s
-        waits.ask(11, read(0x0000, 8, function=1))
+        waits.ask(11, read(0x0000, 8, function=1))  # what was polled is older than max_age_s
         waits.ask(11, read(0xE010, 2))
-        await asyncio.sleep(0.1)
+        assert await idle.read(99) == b"\x83\x0a"  # so what came before it is known
         began = time.monotonic()
         program.process.terminate()
         assert await waits.reply() == b"\x81\x06"
@@ -52,6 +54,63 @@ async def test_the_wire_is_waited_for_the_queue_is_06_and_nobody_new_gets_in(ser
     stopping = program.log().partition("event=stopping")[2]
     assert "event=device_stale" in stopping
     assert not re.search("level=(warning|error|critical)|Traceback", stopping)  # it is what was asked for
+
+
+RULE = '[[modbus.write]]\nsource = ["127.0.0.1"]\npoint = ["float_voltage"]\n'
+VOLTAGE = load_map("prostar-mppt").point("float_voltage").address
+WRITE = b"\x06" + VOLTAGE.to_bytes(2) + b"\x4a\x00"
+
+
+@pytest.mark.parametrize("stays", [True, False], ids=["its client waits", "its client has left"])
+async def test_a_write_on_the_wire_is_waited_for_and_never_called_busy(service: Service, stays: bool) -> None:
+    """It cannot be read back any more, so nobody knows; 06 would say that nothing was done."""
+    service.configure(rest=QUIET + RULE, modbus_keys="writes = true")
+    program = service.start()
+    await service.online()
+    unit = service.units["shelter-a"][0]
+    await unit.is_quiet()
+    unit.turnaround_s = 1.0
+    async with client(service.modbus) as asker:
+        asker.ask(11, WRITE)
+        await unit.is_asked(WRITE)
+        if stays:
+            program.process.terminate()
+            assert await asker.reply() == b"\x86\x0b"
+            assert await asker.reply() == b""
+    if not stays:
+        program.process.terminate()
+    assert await service.ended() == 0
+    assert what_became_of_the_write(service) == (Fate.UNKNOWN, 0x0B)
+    assert unit.asked.count(WRITE) == 1
+
+
+async def test_a_write_that_is_given_up_was_sent_and_is_not_said_not_to_be(service: Service) -> None:
+    service.configure(
+        rest=QUIET + RULE, modbus_keys="writes = true", line_keys="baudrate = 115200\nreply_timeout_s = 10.0"
+    )
+    program = service.start()
+    await service.online()
+    unit = service.units["shelter-a"][0]
+    await unit.is_quiet()
+    async with client(service.modbus) as asker, client(service.modbus) as other, client(service.modbus) as third:
+        unit.never_answered = WRITE
+        asker.ask(11, WRITE)
+        await unit.is_asked(WRITE)
+        other.ask(11, WRITE)
+        assert await third.read(99) == b"\x83\x0a"  # so the other write is known, and waits for the first
+        program.process.terminate()
+        assert await asker.reply() == b"\x86\x0b"
+        assert await other.reply() == b"\x86\x06"
+    assert await service.ended() == 0
+    assert what_became_of_the_write(service) == (Fate.UNKNOWN, 0x0A)
+    assert unit.asked.count(WRITE) == 1
+
+
+def what_became_of_the_write(service: Service) -> tuple[Fate, int | None]:
+    """As the ledger has it, to which the exception belongs."""
+    (entry,) = entries(read_ledger(service.folder / "state"))
+    assert entry.verdict is not None
+    return entry.verdict.fate, entry.verdict.exception
 
 
 async def test_a_controller_that_takes_for_ever_is_given_up_after_five_seconds(service: Service) -> None:
@@ -119,7 +178,7 @@ client_ca_file = "{files.client_ca}"
         frame.send(b"\x00\x01\x00\x00\x00")
         async with client(service.http) as scraper:
             scraper.send(b"GET /metrics HT")
-            await asyncio.sleep(0.1)
+            assert (await service.get("/healthz"))[0] == 200  # so what came before it was read
             began = time.monotonic()
             program.process.terminate()
             for one in (silent, half, frame, scraper):

@@ -139,20 +139,21 @@ async def test_tracing_ends_with_who_asked_and_is_for_nobody_else(service: Servi
     assert "the gateway cannot be asked" in gone.stderr
 
 
-async def test_who_does_not_read_disturbs_nobody_and_loses_pieces(service: Service) -> None:
+async def test_who_does_not_read_disturbs_nobody_and_a_fifth_is_refused(service: Service) -> None:
+    """What becomes of what is not read: tests/service/test_tracing.py."""
     service.configure(rest=FAST)
     service.start()
     await service.online()
     watchers = []
-    for _ in range(5):
+    for number in range(5):
         sock = socket.socket(socket.AF_UNIX)
+        sock.settimeout(30)
         sock.connect(str(service.folder / "state" / "trace"))
         watchers.append(sock)
         with contextlib.suppress(BrokenPipeError):  # the fifth may be refused before it has said what it wants
             sock.sendall(b'"shelter-a"\n')
-        await asyncio.sleep(0.05)
-    watchers[-1].settimeout(5)
-    assert b"4 are watching already" in await asyncio.to_thread(watchers[-1].recv, 4096)
+        answer = await asyncio.to_thread(sock.recv, 4096)
+        assert answer.startswith(b'{"error": "4 are watching already"}' if number == 4 else b'{"format": ')
     async with client(service.modbus) as asker:
         for _ in range(50):
             assert (await asker.read(11))[:2] == b"\x03\x04"
