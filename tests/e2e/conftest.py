@@ -41,6 +41,7 @@ def launch(tmp_path: Path, start: Start, free_tcp_port: Callable[[], int], free_
         trusted: ssl.SSLContext | None = None,
         models: Mapping[str, str] = MODELS,
         upstreams: Mapping[str, int] | None = None,
+        command: Sequence[str] = GATEWAY,
     ) -> Running:
         simulator = None
         if simulate is not None:
@@ -58,7 +59,7 @@ def launch(tmp_path: Path, start: Start, free_tcp_port: Callable[[], int], free_
             models=models,
             upstreams=upstreams,
         )
-        gateway = start(*GATEWAY, "run", "-c", str(tmp_path / "site.toml"))
+        gateway = start(*command, "run", "-c", str(tmp_path / "site.toml"))
         return Running(tmp_path, *ports, gateway, simulator, trusted)
 
     return launcher

@@ -104,6 +104,25 @@ class Program:
             self.process.stderr.close()
 
 
+class StandsStill:
+    """How the gateway is started so that its loop, and nothing else of it, stands still upon a signal."""
+
+    SIGNAL = signal.SIGUSR1
+    SAID = "^standing still$"
+
+    def __init__(self, folder: Path) -> None:
+        self._fifo = folder / "go-on"
+        os.mkfifo(self._fifo)
+        # Python handles signals in the main thread, whose the loop is; who opens a pipe lets other threads run.
+        stand = f"os.write(2, b'standing still\\n'); open({str(self._fifo)!r}).read()"
+        text = f"import os, signal\ndef stand(*_):\n    {stand}\nsignal.signal({int(self.SIGNAL)}, stand)\n"
+        self.command = (sys.executable, "-c", f"{text}from gateway.cli.main import main\nmain()\n")
+
+    def go_on(self) -> None:
+        """Let the loop turn again."""
+        self._fifo.write_text("")
+
+
 def wait_until(condition: Callable[[], object], what: str, timeout_s: float = 60.0) -> None:
     """Ask until it is true; fails naming what was waited for."""
     deadline = time.monotonic() + timeout_s

@@ -222,6 +222,7 @@ def test_a_storm_of_signals_ends_it_like_one(terminal: OpenTerminal) -> None:
     demo = terminal()
     demo.wait_for("array-3")
     children = children_of(demo.process.pid)
+    assert len(children) == 3
     began = time.monotonic()
     for number in (signal.SIGHUP, signal.SIGTERM, signal.SIGINT) * 20:
         demo.process.send_signal(number)
@@ -235,6 +236,7 @@ def test_a_terminal_that_is_closed_ends_it(terminal: OpenTerminal) -> None:
     demo = terminal()
     demo.wait_for("array-3")
     children = children_of(demo.process.pid)
+    assert len(children) == 3
     os.close(demo.master)
     demo.master = os.open(os.devnull, os.O_RDONLY)  # for the fixture to close
     assert demo.process.wait(timeout=ENDS_S) == 0
@@ -245,6 +247,7 @@ def test_ctrl_c_while_it_starts_ends_it(terminal: OpenTerminal) -> None:
     demo = terminal()
     demo.wait_for("Starting the gateway")
     children = children_of(demo.process.pid)
+    assert children
     assert demo.interrupt() < ENDS_S
     assert demo.process.returncode == 0
     assert alive(children) == []
@@ -255,6 +258,7 @@ def test_a_killed_demo_leaves_no_orphans(terminal: OpenTerminal) -> None:
     demo = terminal()
     demo.wait_for("array-3")
     children = children_of(demo.process.pid)
+    assert len(children) == 3
     demo.process.kill()
     demo.process.wait()
     wait_until(lambda: not alive(children), "the end of simulator and gateway", timeout_s=ENDS_S)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from pathlib import Path
 
 import pytest
 
-from gateway.core.site import Site
+from gateway.core.site import Outcome, Site
 from gateway.core.stats import ModbusServerStats
 from gateway.faces.modbus.server import ModbusServer
 from gateway.faces.modbus.settings import ModbusSettings
@@ -16,7 +15,7 @@ from gateway.modbus import mbap
 from gateway.modbus.counters import RtuCounters
 from gateway.modbus.rtu import RtuClient, Timing
 from tests.faults.pty_rig import running
-from tests.faults.rig import MakeRig, read
+from tests.faults.rig import MakeRig, Unit, frame, read
 
 REQUESTS = ("03 0000 0004", "06 E000 0001", "05 0001 FF00", "10 0000 0001 02 0001", "2B 0E 01 00")
 
@@ -52,12 +51,14 @@ def test_no_frame_with_address_0_can_be_sent() -> None:
         client.send(0, bytes.fromhex("06 E000 0001"), 1000.0, 0.5)
 
 
-def test_a_broadcast_of_somebody_else_on_the_line_draws_no_reply(
-    rig: MakeRig, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.WARNING)
-    line = rig()
-    line.wire.receive(bytes.fromhex("00 06 E0 00 00 01"), line.now)  # no CRC: heard by nobody
+def test_a_broadcast_of_somebody_else_is_not_taken_for_the_reply_that_is_waited_for(rig: MakeRig) -> None:
+    """Its frame is heard while a read is out, in the middle of the turnaround."""
+    line = rig(Unit(0, turnaround_s=0.3), retries=0)
+    outcomes: list[Outcome] = []
+    line.read(0, read(0, 4), outcomes.append)
+    line.run(0.1)
+    line.engine.receive(frame(0, read(0, 4)[:1] + b"\x08" + bytes(8)), line.now)
+    assert outcomes == []
     line.run(1.0)
-    assert isinstance(line.ask(0, read(0, 4)), bytes)
-    assert line.units[0].writes == []
+    assert [type(outcome) for outcome in outcomes] == [bytes]  # the oracle has judged it
+    assert line.engine.stats.failed.total() == line.engine.stats.failed["exception"]

@@ -141,11 +141,16 @@ async def test_a_peer_that_never_negotiates_is_given_up_without_blocking(
     assert sum("event=line_down" in message for message in caplog.messages) == 1
 
 
+def descriptors() -> int:
+    """How many this process has open."""
+    return sum(1 for _ in Path("/proc/self/fd").iterdir())
+
+
 @pytest.mark.parametrize("scheme", ["rfc2217", "socket"])
 async def test_a_port_that_opens_after_its_line_was_stopped_is_closed(
     silent_listener: int, device: Device, scheme: str
 ) -> None:
-    before = set(threading.enumerate())
+    before, files = set(threading.enumerate()), descriptors()
     line = make_line(f"{scheme}://127.0.0.1:{silent_listener}", device)
     task = asyncio.create_task(line.run())
     await asyncio.sleep(0)  # its thread has started to open the port
@@ -153,6 +158,7 @@ async def test_a_port_that_opens_after_its_line_was_stopped_is_closed(
     with contextlib.suppress(asyncio.CancelledError):
         await asyncio.wait_for(task, 30)
     await until(lambda: not set(threading.enumerate()) - before)
+    await until(lambda: descriptors() == files)
 
 
 @pytest.mark.parametrize("scheme", ["rfc2217", "socket"])

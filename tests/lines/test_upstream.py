@@ -196,7 +196,8 @@ async def test_a_server_that_closes_at_once_is_no_line_and_is_not_stormed() -> N
     simulated = SimulatedServer([])
     simulated.refusing = True
     async with TcpServer(simulated) as server, running(line_to("127.0.0.1", server.port, devices(1))) as line:
-        await until(lambda: "at once" in line.status(0.0).error or state(line) is LineState.DOWN)
+        await until(lambda: "closes connections at once" in line.status(0.0).error)
+        assert state(line) is LineState.DOWN
         assert line.stats.upstream is not None
         before = line.stats.upstream.connections
         await asyncio.sleep(0.5)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import socket
 import urllib.request
+from pathlib import Path
 
 import pytest
 
-from tests.e2e.programs import Launch, wait_until
+from tests.e2e.programs import Launch, StandsStill, wait_until
 
 
 def test_dead_controllers_and_missing_ports_are_ready(launch: Launch) -> None:
@@ -40,13 +39,14 @@ def test_a_face_that_cannot_listen_is_not_ready_and_named(launch: Launch) -> Non
     wait_until(lambda: site.get("/readyz")[0] == 200, "the freed address", 30.0)
 
 
-def test_a_loop_that_hangs_is_not_healthy(launch: Launch) -> None:
-    site = launch(simulate=None)
+def test_a_loop_that_hangs_is_not_healthy_whatever_other_threads_do(launch: Launch, tmp_path: Path) -> None:
+    still = StandsStill(tmp_path)
+    site = launch(simulate=None, command=still.command)
     wait_until(lambda: site.get("/healthz")[0] == 200, "the HTTP face")
-    os.kill(site.gateway.process.pid, signal.SIGSTOP)
-    try:
-        with pytest.raises(TimeoutError):
-            urllib.request.urlopen(f"http://127.0.0.1:{site.http}/healthz", timeout=0.3)
-    finally:
-        os.kill(site.gateway.process.pid, signal.SIGCONT)
+    site.gateway.process.send_signal(still.SIGNAL)
+    site.gateway.wait_for(still.SAID)
+    with pytest.raises(TimeoutError):
+        urllib.request.urlopen(f"http://127.0.0.1:{site.http}/healthz", timeout=0.3)
+    still.go_on()
     wait_until(lambda: site.get("/healthz")[0] == 200, "the loop again")
+    assert site.gateway.end() == 0

@@ -74,6 +74,7 @@ async def test_its_place_is_free_again(
     try:
         async with asyncio.timeout(30):
             assert await client.stdout.readline() == b"asked\n"
+        assert len(line.waiting) == unacknowledged
         cable.cut()
         line.release()  # with a question under way its reply goes out, and nobody says that it has come
         async with asyncio.timeout(within_s):

@@ -19,7 +19,7 @@ from gateway.errors import ListenError
 from tests.e2e.programs import GATEWAY, Program
 from tests.faces.modbus.conftest import Client, read
 from tests.faces.modbus.tls.conftest import ServeTls
-from tests.faces.modbus.tls.site import SERVER, Pki
+from tests.faces.modbus.tls.site import SERVER, Pki, role, utf8
 
 pytestmark = pytest.mark.peer
 
@@ -55,12 +55,19 @@ async def test_f48_new_connections_use_the_new_files_and_open_ones_go_on(serve_t
 async def test_f48_another_client_authority(serve_tls: ServeTls, pki: Pki) -> None:
     site = await serve_tls()
     pki.authority("new-ca")
-    pki.issue("newcomer", issuer="new-ca")
-    server_ca = pki.client("reader")
+    pki.issue("newcomer", issuer="new-ca", extensions=[role(utf8("reader"))])
+    reader, newcomer = pki.client("reader"), pki.client("newcomer")  # whom they trust is as before
+
+    async def is_served(context: ssl.SSLContext) -> bool:
+        try:
+            return await (await site.connect(None, context=context)).query(11, PDU) == REPLY
+        except (ssl.SSLError, ConnectionError, EOFError):
+            return False
+
+    assert (await is_served(reader), await is_served(newcomer)) == (True, False)
     shutil.copy(pki.folder / "new-ca.pem", pki.folder / "ca.pem")
     site.reload()
-    with pytest.raises((ssl.SSLError, ConnectionError, EOFError)):
-        await (await site.connect(None, context=server_ca)).query(11, PDU)
+    assert (await is_served(reader), await is_served(newcomer)) == (False, True)
 
 
 BAD: dict[str, Callable[[Pki], object]] = {
