@@ -6,6 +6,7 @@ Advice never keeps the gateway from starting. Each begins with the key path, as 
 from __future__ import annotations
 
 import ipaddress
+import os
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from gateway.devices.schema import models
 from gateway.devices.unknown import AUTO
 from gateway.service.notify import notify_advice
 from gateway.service.parsing import DOCUMENTATION_ROOT, parse_listen, parse_root
+from gateway.service.secret_files import open_to_all
 from gateway.service.snmp import snmp_advice, snmp_on
 from gateway.service.tls import tls_advice
 from gateway.service.writes import write_advice
@@ -83,7 +85,7 @@ def _port(path: str, line: LineTable, seen: dict[str, str]) -> Iterator[str]:
     if _NAMELESS.match(port):
         text = "adapters of this kind have no serial number of their own, so two of them share one name"
         yield f"{path}: {text}; use the name of the socket in /dev/serial/by-path"
-    real = str(Path(port).resolve())
+    real = os.path.realpath(port)  # never raises, unlike `Path.resolve`: a loop of links is the port's trouble
     if real in seen:
         yield f"{path}: {port} is at present the same port as {seen[real]}; only one line can have it"
     seen.setdefault(real, path)
@@ -142,15 +144,10 @@ def _http(config: Config) -> Iterator[str]:
             yield f"{path}: {text} can be reached from other machines, and without TLS the secret is sent in clear"
     for key, name in {**secrets, "tls_private_key": http.tls_private_key}.items():
         if name:
-            yield from _secret_file(f"http.{key}", Path(name))
+            yield from _readable(f"http.{key}", Path(name))
+            yield from open_to_all(f"http.{key}", name)
     if http.tls_certificate:
         yield from _readable("http.tls_certificate", Path(http.tls_certificate))
-
-
-def _secret_file(key: str, path: Path) -> Iterator[str]:
-    yield from _readable(key, path)
-    if path.is_file() and path.stat().st_mode & 0o007:
-        yield f"{key}: {path} is open to every user of this machine (mode {path.stat().st_mode & 0o777:03o})"
 
 
 def _readable(key: str, path: Path) -> Iterator[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -33,7 +34,11 @@ def unreadable_text(text: str, error: OSError) -> str:
 
 
 def open_to_all(key: str, text: str) -> Iterator[str]:
-    """Advice when every user of the machine can read the file."""
+    """Advice when every user of the machine can read the file; none of one that cannot be looked at."""
     path = secret_path(text)
-    if path.is_file() and path.stat().st_mode & 0o007:  # it is there: its name is no secret
-        yield f"{key}: {path} is open to every user of this machine (mode {path.stat().st_mode & 0o777:03o})"
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return
+    if stat.S_ISREG(mode) and mode & 0o007:  # it is there: its name is no secret
+        yield f"{key}: {path} is open to every user of this machine (mode {mode & 0o777:03o})"

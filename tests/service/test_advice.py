@@ -101,6 +101,13 @@ def test_two_names_of_one_port_are_noticed(tmp_path: Path) -> None:
     )
 
 
+def test_links_that_lead_in_a_circle_are_no_matter_of_advice(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to(tmp_path / "b")
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    line = f'[[line]]\nname = "a"\nport = "{tmp_path / "a"}"\n{DEVICE.format(n=1)}'
+    assert advised(f"{HEAD}{line}{OWN_ROOT}{COMMUNITY}") == ()
+
+
 def test_a_face_that_is_off_needs_no_advice() -> None:
     assert advised(f"{HEAD}{LINE}[snmp]\nlisten = []\n") == ()
 
@@ -119,3 +126,13 @@ def test_secret_files_are_looked_at(tmp_path: Path) -> None:
     assert advised(text)[1:] == (f"http.bearer_token_file: {token} is open to every user of this machine (mode 644)",)
     token.chmod(0o640)
     assert len(advised(text)) == 1
+
+
+def test_a_secret_file_that_cannot_even_be_looked_at_is_named(tmp_path: Path) -> None:
+    """Such as one in a folder that only root may enter; root itself is refused a name that is too long."""
+    token = tmp_path / ("t" * 300)
+    text = f'{CLEAN}[http]\nbearer_token_file = "{token}"\n[[snmp.notify]]\naddress = "127.0.0.1:162"\n'
+    text += f'community_file = "{token}"\n'
+    [community, unreadable] = advised(text)
+    assert community.endswith("cannot be read: File name too long; the gateway will not start without it")
+    assert unreadable.endswith("cannot be read (File name too long); the HTTP face stays closed until it can")
