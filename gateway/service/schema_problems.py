@@ -70,7 +70,8 @@ def _text(error: ErrorDetails) -> str:
     if kind == "missing":
         return f"is missing{allowed}"
     name = next((part for part in reversed(path) if isinstance(part, str)), "")
-    shown = "the value" if key and key.secret else show_file(value) if _NAMES_A_FILE.search(name) else show(value)
+    secret = (key and key.secret) or _holds_secrets(table_at(path))
+    shown = "the value" if secret else show_file(value) if _NAMES_A_FILE.search(name) else show(value)
     if kind == "too_short":
         return f"is empty{allowed}"
     if kind in _OUT_OF_RANGE:
@@ -84,6 +85,15 @@ def _unknown(path: Path) -> str:
     near = difflib.get_close_matches(str(path[-1]), keys, n=1)
     hint = f'did you mean "{near[0]}"? ' if near else ""
     return f"unknown key; {hint}allowed: {', '.join(keys)}"
+
+
+def _holds_secrets(table: type[BaseModel] | None) -> bool:
+    """Whether there are secrets, or names of files with some, in the table: what stands in its place may be one."""
+    for name, field in table.model_fields.items() if table else ():
+        key = next((data for data in field.metadata if isinstance(data, Key)), None)
+        if (key and key.secret) or _NAMES_A_FILE.search(name) or _holds_secrets(_table_of(field)):
+            return True
+    return False
 
 
 def _table_of(field: FieldInfo) -> type[BaseModel] | None:

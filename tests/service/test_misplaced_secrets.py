@@ -89,6 +89,22 @@ def test_no_problem_shows_what_is_no_path(path: Path, value: object) -> None:
     assert "70707070707" not in found
 
 
+@pytest.mark.parametrize(
+    "path",
+    [(("snmp", False),), (("http", False),), (("modbus", False), ("tls", False))]
+    + [(("snmp", False), (name, is_list)) for name in ("community", "user", "notify") for is_list in (False, True)],
+    ids=lambda path: ".".join(name + "[]" * is_list for name, is_list in path),
+)
+@pytest.mark.parametrize("value", [SECRET, [SECRET], {"name": SECRET, "source": ["127.0.0.1"]}], ids=json.dumps)
+def test_no_problem_shows_what_stands_in_the_place_of_a_table_with_secrets(path: Path, value: object) -> None:
+    """Such as `community = "…"` below `[snmp]`, and `[snmp.community]` for `[[snmp.community]]`."""
+    assert SECRET not in problems(path, value)
+
+
+def test_what_stands_in_the_place_of_another_table_is_shown() -> None:
+    assert '{"live_s": 1.0} is not a list' in problems((("line", False),), {"live_s": 1.0})
+
+
 def test_a_path_is_shown() -> None:
     (user,) = [path for path in KEYS if path[-1][0] == "key_file"]
     assert "/etc/keys/server.key" not in problems(user, "/etc/keys/server.key"), "it is right"
