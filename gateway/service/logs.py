@@ -4,6 +4,7 @@ Rule 1: an event is one line whatever a peer sent: line ends and other control c
 traceback takes more lines, and in JSON not even that.
 Rule 2: a message of a library, which knows no events, becomes `event=log logger=… message="…"`.
 Rule 3: a log that cannot be written never disturbs the gateway (log_writer.py).
+Rule 4: a value ends where it ends: one with blanks or quotes in it, such as the name of a line, is quoted as in JSON.
 """
 
 from __future__ import annotations
@@ -20,7 +21,11 @@ from gateway.service.log_writer import LogWriter
 _EVENT = re.compile(r"event=\S")
 _BARE_EVENT = re.compile(r"[a-z][a-z0-9_]*(?= [a-z][a-z0-9_]*=|$)")
 _PAIR = re.compile(r'([A-Za-z_][A-Za-z0-9_.]*)=("(?:[^"\\]|\\.)*"(?= |$)|"[^"]*"|[^ ]*)')
+_QUOTED = re.compile(r'"(?:[^"\\]|\\.)*"')
+_NEEDS_QUOTES = re.compile(r'[\s"]')
+_NEEDS_ESCAPES = re.compile(r'["\\]')
 _NUMBER = re.compile(r"-?(0|[1-9][0-9]{0,17})(\.[0-9]{1,17})?")
+_PLACE = re.compile(r'%%|(?<==)%s(?= |$)|(?<==")%s(?="( |$))|%[^%a-zA-Z]*[a-zA-Z]')
 _CONTROL = re.compile(r"[\x00-\x1f\x7f\x80-\x9f\u2028\u2029]")
 
 
@@ -72,8 +77,8 @@ FORMATTERS: Mapping[Form, type[EventFormatter]] = {Form.TEXT: EventFormatter, Fo
 
 
 def event_of(record: logging.LogRecord) -> str:
-    """The message as an event (rules 1 and 2)."""
-    message = _CONTROL.sub(_escape, record.getMessage())
+    """The message as an event (rules 1, 2 and 4)."""
+    message = _CONTROL.sub(_escape, _message(record))
     if _BARE_EVENT.match(message):
         return f"event={message}"
     if not _EVENT.match(message):
@@ -103,6 +108,29 @@ class Log:
     def use(self, level: str, form: str) -> None:
         """Log like this from now on."""
         set_up_logging(self._level or Level(level), Form(form), self._writer)
+
+
+def _message(record: logging.LogRecord) -> str:
+    """The message with its values in it (rule 4)."""
+    if not isinstance(record.args, tuple) or not record.args or not isinstance(record.msg, str):
+        return record.getMessage()
+    places = [place for place in _PLACE.finditer(record.msg) if place.group() != "%%"]
+    if len(places) != len(record.args):
+        return record.getMessage()
+    values = tuple(_quoted(value, place) for value, place in zip(record.args, places, strict=True))
+    return record.msg % values
+
+
+def _quoted(value: object, place: re.Match[str]) -> object:
+    """A value as it can stand in its place: behind `key=`, within the quotes of `key="…"`, or anywhere else."""
+    if not isinstance(value, str) or place.group() != "%s" or place.start() == 0:
+        return value
+    before = place.string[place.start() - 1]
+    if before == "=" and _NEEDS_QUOTES.search(value) and not _QUOTED.fullmatch(value):
+        return json.dumps(value, ensure_ascii=False)
+    if before == '"' and _NEEDS_ESCAPES.search(value):
+        return json.dumps(value, ensure_ascii=False)[1:-1]
+    return value
 
 
 def _value(text: str) -> object:

@@ -97,6 +97,26 @@ def test_json_has_the_keys_of_the_event(message: str, expected: dict[str, object
     assert as_json(message) == expected
 
 
+@pytest.mark.parametrize("name", ["shelter a", 'the "old" line', "C:\\x y", "a=b c=d", '"', "ends in \\", "a\tb"])
+@pytest.mark.parametrize(
+    ("message", "quoted"), [("event=line_down line=%s n=%d", False), ('event=x n=%d of="100%%" line="%s"', True)]
+)
+def test_a_name_is_whole_whatever_is_in_it(name: str, message: str, quoted: bool) -> None:
+    found = as_json(message, *((3, name) if quoted else (name, 3)))
+    assert (found["line"], found["n"]) == (name, 3)
+    assert not set(found) - {"event", "line", "n", "of"}
+
+
+def test_only_a_name_that_needs_quotes_has_them() -> None:
+    assert formatted("event=x line=%s", "shelter-a").endswith("event=x line=shelter-a")
+    assert formatted("event=x line=%s", "shelter a").endswith('event=x line="shelter a"')
+    assert formatted('event=x line="%s"', "shelter a").endswith('event=x line="shelter a"')
+    assert formatted("event=x error=%s", '"no \\"port\\""').endswith('event=x error="no \\"port\\""'), (
+        "it has them already"
+    )
+    assert formatted("event=line_up line=%s%s", "a", " down_s=1").endswith("line=a down_s=1"), "a piece of an event"
+
+
 @given(st.text(max_size=200))
 def test_json_is_one_line_whatever_is_in_it(text: str) -> None:
     assert as_json('event=x peer="%s" n=1', text)["event"] == "x"
