@@ -14,7 +14,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Self, cast
@@ -58,6 +58,10 @@ class Reading:
         with self._process:
             pass
 
+    def give_up(self) -> None:
+        """End its process, so that whoever waits for the result, in another thread, need not go on; never waits."""
+        self._process.kill()
+
     def result(self) -> Config:
         """Wait for the end: the configuration; ConfigError with everything that is wrong, or ReadingFailed."""
         try:
@@ -67,9 +71,13 @@ class Reading:
         return _result(written, f"{self._path}: the process that reads it ended with status {self._process.returncode}")
 
 
-def read_config(path: Path) -> Config:
-    """The configuration in the file; ConfigError as `load_config`, ReadingFailed when it could not be read (rule 4)."""
+def read_config(path: Path, begun: Callable[[Reading], None] = lambda _reading: None) -> Config:
+    """The configuration in the file; ConfigError as `load_config`, ReadingFailed when it could not be read (rule 4).
+
+    `begun` is told of the reading, so that another thread may give it up.
+    """
     with Reading(path) as reading:
+        begun(reading)
         return reading.result()
 
 

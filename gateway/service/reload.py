@@ -26,7 +26,7 @@ from gateway.service.garbage import set_aside
 from gateway.service.gateway import Gateway
 from gateway.service.logs import Log
 from gateway.service.plain import with_values
-from gateway.service.reading import read_config
+from gateway.service.reading import Reading, read_config
 from gateway.service.systemd import Systemd
 
 if TYPE_CHECKING:  # what it is at run time, plain.py says
@@ -72,7 +72,7 @@ class Reloader:
         gateway = self._gateway
         before, site = gateway.config, gateway.site
         try:
-            config = await asyncio.to_thread(read_config, self._path)
+            config = await self._read()
             for key in (key for key in NEEDS_RESTART if getattr(config, key) != getattr(before, key)):
                 _log.warning("event=reload_needs_restart key=%s kept=old", key)
             config = with_values(config, {key: getattr(before, key) for key in NEEDS_RESTART})
@@ -92,6 +92,16 @@ class Reloader:
             set_aside()
         changed = changes(before, config)
         _log.info('event=reloaded changed="%s" took_s=%.3f', _some(changed), self._clock.monotonic() - began)
+
+    async def _read(self) -> Config:
+        """What the file holds. Who stops meanwhile does not wait for a file that hangs: its thread would."""
+        begun: list[Reading] = []
+        try:
+            return await asyncio.to_thread(read_config, self._path, begun.append)
+        except asyncio.CancelledError:
+            for reading in begun:
+                reading.give_up()
+            raise
 
     async def _change(self, config: Config) -> None:
         plan = await self._gateway.plan(config)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import re
+import signal
 import socket
 import struct
 import time
@@ -185,4 +187,28 @@ client_ca_file = "{files.client_ca}"
                 assert await one.reply() == b""
     assert await service.ended() == 0
     assert time.monotonic() - began < STOP_GRACE_S
+    assert "Traceback" not in program.log()
+
+
+async def test_a_reload_whose_file_hangs_holds_up_nothing(service: Service) -> None:
+    """The pipe is a file on a disk or a network that gives nothing."""
+    service.configure()
+    program = service.start()
+    await service.online()
+    service.config.unlink()
+    os.mkfifo(service.config)
+    program.process.send_signal(signal.SIGHUP)
+    writing: int | None = None
+    async with asyncio.timeout(60):
+        while writing is None:
+            with contextlib.suppress(OSError):  # nobody reads it yet
+                writing = os.open(service.config, os.O_WRONLY | os.O_NONBLOCK)
+            await asyncio.sleep(0.01)
+    read_on = asyncio.get_running_loop().call_later(15.0, os.close, writing)
+    began = time.monotonic()
+    program.process.terminate()
+    assert await service.ended() == 0
+    assert time.monotonic() - began < 12.0  # it did not wait for the file
+    read_on.cancel()
+    os.close(writing)
     assert "Traceback" not in program.log()
