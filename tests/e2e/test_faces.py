@@ -10,6 +10,7 @@ import math
 import re
 import struct
 import subprocess
+import urllib.error
 import urllib.request
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -345,6 +346,9 @@ def test_promtool_and_a_real_prometheus_have_nothing_to_complain_about(
         try:
             with urllib.request.urlopen(f"http://{web}/api/v1/query?query={text}", timeout=5) as reply:
                 answer = json.load(reply)
+        except urllib.error.HTTPError as error:
+            error.close()
+            return []
         except OSError:
             return []
         result: list[Mapping[str, object]] = answer["data"]["result"]
