@@ -104,6 +104,15 @@ clean: ## Remove .venv and everything that was made by a tool.
 	  .import_linter_cache *.egg-info
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
+# Whether `make PYTHON=...` names another interpreter than .venv was made with: then that environment is made anew.
+WHICH_PYTHON := import sys; print(sys.version, sys.base_prefix)
+ifneq ($(PYTHON),)
+  ifneq ($(shell "$(PYTHON)" -c '$(WHICH_PYTHON)' 2>&1),$(shell "$(BIN)/python" -c '$(WHICH_PYTHON)' 2>&1))
+    .PHONY: $(BIN)/python
+    ANOTHER_PYTHON := $(BIN)/python
+  endif
+endif
+
 # The environment. Debian has Python without the module that makes environments; it is installed if it may be.
 $(BIN)/python:
 	@python=; \
@@ -127,16 +136,16 @@ define install
 	$(call step,install this clone,$(PIP) install --no-deps --no-build-isolation --editable .)
 endef
 
-# Order-only: a newer interpreter link is no reason to install again.
-$(VENV)/.runtime: requirements.txt pyproject.toml | $(BIN)/python
+# Order-only: a newer interpreter link is no reason to install again, but another interpreter is.
+$(VENV)/.runtime: requirements.txt pyproject.toml $(ANOTHER_PYTHON) | $(BIN)/python
 	$(call install,requirements.txt)
 	@touch $@
 
-$(VENV)/.dev: requirements-dev.txt pyproject.toml | $(BIN)/python
+$(VENV)/.dev: requirements-dev.txt pyproject.toml $(ANOTHER_PYTHON) | $(BIN)/python
 	$(call install,requirements-dev.txt)
 	@touch $@ $(VENV)/.runtime
 
-$(VENV)-audit/.ready: requirements-audit.txt | $(BIN)/python
+$(VENV)-audit/.ready: requirements-audit.txt $(ANOTHER_PYTHON) | $(BIN)/python
 	@rm -rf $(VENV)-audit; $(BIN)/python -m venv $(VENV)-audit
 	$(call step,install requirements-audit.txt,$(VENV)-audit/bin/python -m pip --disable-pip-version-check --quiet --quiet install --require-hashes --requirement requirements-audit.txt)
 	@touch $@
