@@ -105,25 +105,11 @@ class Answer:
 
     def read(self, counters: SnmpCounters, now: float) -> None:
         """Make the reply of what there is now. Raises NotSnmp when a name is none."""
-        request, room = self._request, self.room
         self._window.refresh()
         reading = Reading(self._window, now)
-        status, index = ErrorStatus.NO_ERROR, 0
         varbinds: bytes | None
         try:
-            if request.kind == reader.SET:
-                counters.bad_community_uses += 1
-                status, index = ErrorStatus.NOT_WRITABLE, min(1, len(request.names))
-                varbinds = request.varbinds
-            elif request.kind == reader.GET_BULK:
-                varbinds = reading.bulk(request, room)
-            else:
-                each = reading.get if request.kind == reader.GET else reading.next
-                found = [each(name) for name in request.names]
-                varbinds = b"".join([varbind for varbind, _ in found])
-                if self._version == reader.VERSION_1:
-                    index = next((at for at, (_, there) in enumerate(found, 1) if not there), 0)
-                    status = ErrorStatus.NO_SUCH_NAME if index else status
+            status, index, varbinds = self._read(reading, counters)
         except NotSnmp:
             raise
         except Exception:  # noqa: BLE001 - the datagram edge: a defect of ours must not cost the asker its reply
@@ -131,7 +117,7 @@ class Answer:
             if counters.internal_errors % TOLD == 1:
                 _log.exception("event=snmp_internal_error count=%d", counters.internal_errors)
             status, index, varbinds = ErrorStatus.GEN_ERR, 0, b""
-        if varbinds is None or len(varbinds) > room:
+        if varbinds is None or len(varbinds) > self.room:
             status, index, varbinds = ErrorStatus.TOO_BIG, 0, b""
         if status is ErrorStatus.NO_ERROR:
             self._depend(reading)
@@ -140,12 +126,30 @@ class Answer:
             if self._version == reader.VERSION_1:
                 # RFC 1157 §4.1: an error comes with what was asked; notWritable does not exist.
                 status = ErrorStatus.NO_SUCH_NAME if status is ErrorStatus.NOT_WRITABLE else status
-                varbinds = request.varbinds
+                varbinds = self._request.varbinds
         self._put(wire.result(status.value, index, varbinds))
 
     def octets(self) -> int:
         """What it takes of memory, about."""
         return len(self.before) + len(self.after) + 16 * len(self._devices) + _OBJECT_OCTETS
+
+    def _read(self, reading: Reading, counters: SnmpCounters) -> tuple[ErrorStatus, int, bytes | None]:
+        """Error status, index and varbinds; None instead of these for too many."""
+        request = self._request
+        if request.too_many:
+            return ErrorStatus.TOO_BIG, 0, None
+        if request.kind == reader.SET:
+            counters.bad_community_uses += 1
+            return ErrorStatus.NOT_WRITABLE, min(1, len(request.names)), request.varbinds
+        if request.kind == reader.GET_BULK:
+            return ErrorStatus.NO_ERROR, 0, reading.bulk(request, self.room)
+        each = reading.get if request.kind == reader.GET else reading.next
+        found = [each(name) for name in request.names]
+        varbinds = b"".join([varbind for varbind, _ in found])
+        index = 0
+        if self._version == reader.VERSION_1:
+            index = next((at for at, (_, there) in enumerate(found, 1) if not there), 0)
+        return ErrorStatus.NO_SUCH_NAME if index else ErrorStatus.NO_ERROR, index, varbinds
 
     def _depend(self, reading: Reading) -> None:
         """Remember the devices and their snapshots; the reading of this very moment was made of them."""

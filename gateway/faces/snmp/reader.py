@@ -8,10 +8,12 @@ RFC 3417 §8 allows SNMP a small part of BER: definite lengths and primitive str
    `Unusual`.
 3. What is unusual is decoded by pysnmp's classes (`odd_request`), which decide whether it is SNMP. Both give a
    `Request`; tests/faces/snmp/test_paths.py proves that they give the same one.
+4. pysnmp takes 80 µs a name, so it is given MOST_ODD of them at most, and nothing that is no request by its form.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 from pyasn1.codec.ber import decoder, encoder
@@ -32,6 +34,9 @@ GET_BULK = 0xA5
 MAX_ARCS = 128
 """RFC 2578 §3.5: an OID has no more."""
 
+MOST_ODD = 32
+"""Names in an unusual request; one with more is told that the reply would be too big (`Request.too_many`)."""
+
 _MAX_ARC = 0xFFFFFFFF
 _ZEROS = b"\x02\x01\x00\x02\x01\x00"
 _NULL = b"\x05\x00"
@@ -48,7 +53,7 @@ class Unusual(ValueError):
 class Request:
     """A PDU of one of the four kinds that an agent answers."""
 
-    __slots__ = ("first", "id_at", "kind", "names", "request_id", "second", "varbinds")
+    __slots__ = ("first", "id_at", "kind", "names", "request_id", "second", "too_many", "varbinds")
 
     def __init__(
         self, kind: int, request_id: bytes, counts: tuple[int, int], names: list[bytes], varbinds: bytes
@@ -59,6 +64,7 @@ class Request:
         self.first, self.second = counts  # non-repeaters and max-repetitions of GETBULK
         self.names = names  # encoded OBJECT IDENTIFIERs
         self.varbinds = varbinds  # as they came, encoded, one after the other
+        self.too_many = False  # more names than are read; `names` is empty then
 
 
 def content(data: bytes, at: int, end: int, tag: int) -> tuple[int, int]:
@@ -219,6 +225,8 @@ def _count(data: bytes, at: int) -> tuple[int, int]:
     return int.from_bytes(data[at + 2 : stop], "big"), stop
 
 
+_CONSTRUCTED = 0x20
+
 _KINDS: dict[int, dict[type, int]] = {
     VERSION_1: {rfc1157.GetRequestPDU: GET, rfc1157.GetNextRequestPDU: GET_NEXT, rfc1157.SetRequestPDU: SET},
     VERSION_2C: {
@@ -230,6 +238,10 @@ _KINDS: dict[int, dict[type, int]] = {
 }
 
 
+_NO_REQUESTS = {VERSION_1: (b"\xa2", b"\xa4"), VERSION_2C: (b"\xa2", b"\xa6", b"\xa7", b"\xa8")}
+"""What the other PDUs of a version begin with."""
+
+
 def odd_request(data: bytes, at: int, spoken: int) -> Request | None:
     """The PDU that begins at `at`, read by pysnmp; None when it is no request.
 
@@ -237,6 +249,11 @@ def odd_request(data: bytes, at: int, spoken: int) -> Request | None:
     malformed BER.
     """
     spoken = VERSION_1 if spoken == VERSION_1 else VERSION_2C
+    if data[at : at + 1] in _NO_REQUESTS[spoken]:
+        return None
+    many = _too_many(data, at, _KINDS[spoken].values())
+    if many is not None:
+        return many
     choice = rfc1157.PDUs() if spoken == VERSION_1 else rfc1905.PDUs()
     found, rest = decoder.decode(data[at:], asn1Spec=choice)
     if rest:
@@ -254,3 +271,35 @@ def odd_request(data: bytes, at: int, spoken: int) -> Request | None:
     varbinds = b"".join(encoder.encode(pair) for pair in pdu[3])
     counts = (int(pdu[1]), int(pdu[2])) if kind == GET_BULK else (0, 0)
     return Request(kind, wire.integer(0x02, int(pdu[0])), counts, names, varbinds)
+
+
+def _too_many(data: bytes, at: int, kinds: Collection[int]) -> Request | None:
+    """The request that begins at `at`, if it has more than MOST_ODD names.
+
+    NotSnmp when it has not the form of one of these kinds: tags and definite lengths, and values that are primitive.
+    """
+    end = len(data)
+    kind = data[at] if at < end else 0
+    if kind not in kinds:
+        raise NotSnmp("no PDU")
+    at, stop = content(data, at, end, kind)
+    first, at = content(data, at, stop, 0x02)
+    request_id = data[first:at]
+    for _ in range(2):
+        _, at = content(data, at, stop, 0x02)
+    first, at = content(data, at, stop, 0x30)
+    if not at == stop == end:
+        raise NotSnmp("octets behind the message")
+    names, at = 0, first
+    while at < end:
+        start, at = content(data, at, end, 0x30)
+        _, start = content(data, start, at, 0x06)
+        if start == at or data[start] & _CONSTRUCTED or content(data, start, at, data[start])[1] != at:
+            raise NotSnmp("no varbind")
+        names += 1
+    if names <= MOST_ODD:
+        return None
+    number, _ = integer(wire.tlv(0x02, request_id), 0, len(request_id) + 2)
+    request = Request(kind, wire.integer(0x02, number), (0, 0), [], data[first:end])
+    request.too_many = True
+    return request

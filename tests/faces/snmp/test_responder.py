@@ -17,7 +17,9 @@ from pysnmp.proto import rfc1901
 from pysnmp.proto.api import v2c
 
 from gateway.core.site import Device, Site
+from gateway.faces.snmp import reader
 from gateway.faces.snmp.agent import SnmpAgent
+from gateway.faces.snmp.reader import MOST_ODD
 from gateway.faces.snmp.responder import DATAGRAM_LIMIT, ODD_OCTETS, Refusal, Refused
 from gateway.faces.snmp.settings import REPLY_LIMIT, Community, Oid
 from tests.faces.snmp.stub_site import StubClock
@@ -96,15 +98,36 @@ def test_what_only_pysnmp_can_read_uses_up_the_allowance_by_its_length(
         assert agent.counters.rate_limited == 1
         return count
 
-    names = [SYS_DESCR] * 60
+    names = [(1, 3)] * MOST_ODD
     plain, odd = request(v2c.GetRequestPDU, *names), request(v2c.GetRequestPDU, *names, value=v2c.Integer(0))
     assert answered(plain) == 100
-    assert answered(odd) == math.ceil(100 / (1 + len(odd) / ODD_OCTETS)) == 3
+    assert answered(odd) == math.ceil(100 / (1 + len(odd) / ODD_OCTETS)) == 8
     agent = make_agent(requests_per_s=10.0)
-    for _ in range(3):
+    for _ in range(8):
         assert agent.answer(odd, LOCAL) is not None
     clock.now += 100.0
     assert agent.answer(plain, LOCAL) is not None, "it comes back with time"
+
+
+@pytest.mark.parametrize("kind", [v2c.GetRequestPDU, v2c.GetNextRequestPDU, v2c.GetBulkRequestPDU, v2c.SetRequestPDU])
+def test_more_than_pysnmp_can_read_in_a_moment_is_too_big(
+    answer: Answer, kind: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who asks so asks for less then, as whoever is told that a reply would be too big (RFC 3416 §4.2.1)."""
+    value = v2c.Integer(0)
+    assert answer(request(kind, *[END] * MOST_ODD, value=value)).status in {0, NOT_WRITABLE}
+    monkeypatch.setattr(reader, "decoder", None)  # which is not asked
+    reply = answer(request(kind, *[END] * (MOST_ODD + 1), value=value))
+    assert (reply.status, reply.index, reply.names) == (TOO_BIG, 0, [])
+
+
+def test_too_big_comes_with_what_was_asked_in_version_1(make_agent: Callable[..., SnmpAgent]) -> None:
+    asked = bytearray(request(v2c.GetRequestPDU, *[(1, 3)] * (MOST_ODD + 1), value=v2c.Integer(0)))
+    asked[asked.index(b"\x02\x01\x01") + 2] = 0
+    expected = (
+        bytes(asked).replace(b"\xa0\x82", b"\xa2\x82").replace(b"\x02\x01\x00\x02\x01\x00", b"\x02\x01\x01\x02\x01\x00")
+    )
+    assert make_agent(v1=True).answer(bytes(asked), LOCAL) == expected
 
 
 def test_get_tells_missing_instances_from_missing_objects(answer: Answer) -> None:
@@ -244,6 +267,11 @@ HEAD = b"\x02\x01\x01\x02\x01\x00\x02\x01\x00"
         _raw(HEAD + b"\x30\x0c\x30\x0a\x06\x06\x2b\x90\x80\x80\x80\x00\x05\x00"),  # an arc of 2³²
         _raw(b"\x02\x09\x01" + b"\x00" * 8 + HEAD[3:] + b"\x30\x00"),  # request-id of 65 bits
         _raw(HEAD + b"\x30" * 200),
+        _raw(HEAD + b"\x30\x81\xc8" + b"\x30\x03\x06\x01\x2b" * 40).replace(b"\xa0", b"\xa9"),  # no PDU
+        _raw(HEAD + b"\x30\x09\x30\x07\x06\x01\x2b\x24\x02\x04\x00"),  # a string of strings (RFC 3417 §8)
+        _raw(HEAD + b"\x30\x09\x30\x80\x06\x01\x2b\x05\x00\x00\x00"),  # no length
+        _raw(HEAD + b"\x30\x07\x30\x05\x06\x01\x2b\x05\x00\x00"),  # octets behind the list
+        _raw(HEAD + b"\x30\x05\x30\x03\x06\x01\x2b"),  # no value
         _raw(b"\x30\x80" * 300),
         _raw(HEAD + b"\x30\x00")[:-1],
         b"\x30\x82",
