@@ -13,9 +13,9 @@ import errno
 import socket
 import ssl
 from collections.abc import Callable
-from contextlib import suppress
 
 from gateway.faces.binding import listening_socket
+from gateway.faces.http.connection import Connection
 from gateway.faces.http.own import HttpStats
 
 ACCEPT_TURN = 32
@@ -34,7 +34,7 @@ class Handshakes:
         *,
         most: int,
         timeout_s: float,
-        protocol: Callable[[], asyncio.BaseProtocol],
+        protocol: Callable[[], Connection],
     ) -> None:
         self.most = most
         self.timeout_s = timeout_s
@@ -108,10 +108,16 @@ class Handshakes:
         task = asyncio.current_task()
         assert task is not None
         self._pending[task] = None
-        with suppress(OSError):  # TLS errors and time-outs are among them
+        connection = self._protocol()
+        try:
             await asyncio.get_running_loop().connect_accepted_socket(
-                self._protocol, sock, ssl=self.tls, ssl_handshake_timeout=self.timeout_s
+                lambda: connection, sock, ssl=self.tls, ssl_handshake_timeout=self.timeout_s
             )
+        except OSError:  # TLS errors and time-outs are among them
+            pass
+        except asyncio.CancelledError:
+            connection.abort()  # which has come in, if the handshake was done in this turn, and would end politely
+            raise
 
     def _wait(self, sock: socket.socket) -> None:
         loop = asyncio.get_running_loop()

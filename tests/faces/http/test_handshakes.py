@@ -5,11 +5,14 @@ from __future__ import annotations
 import asyncio
 import ssl
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from aiohttp import ClientSession, ClientTimeout
 
+from gateway.faces.http.connection import Connection
+from gateway.faces.http.handshakes import Handshakes
 from gateway.service.loops import Loop, loop_factory
 
 from .conftest import Gateway
@@ -68,3 +71,52 @@ async def test_stopping_ends_handshakes(make_gateway: MakeGateway, tmp_path: Pat
             await listener.stop()
         assert [await still_open(streams) for streams in opened] == [False] * 3
         assert gateway.face.listeners[0].bound is None
+
+
+class EndedAtOnce(Connection):
+    """Its handshake is done, and in this very turn of the loop it has to make room."""
+
+    handshakes: Handshakes
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        self.handshakes._end(next(iter(self.handshakes._pending)))
+
+
+@pytest.mark.parametrize("choice", [Loop.ASYNCIO, Loop.UVLOOP])
+def test_one_that_makes_room_when_it_is_done_waits_for_nobody(
+    make_gateway: MakeGateway, tmp_path: Path, choice: Loop
+) -> None:
+    if choice is Loop.UVLOOP:
+        pytest.importorskip("uvloop")
+    with asyncio.Runner(loop_factory=loop_factory(choice)) as runner:
+        runner.run(_ended_when_done(make_gateway, tmp_path))
+
+
+async def _ended_when_done(make_gateway: MakeGateway, tmp_path: Path) -> None:
+    crt, key = certificate(tmp_path)
+    gateway = make_gateway(tls_certificate=crt, tls_private_key=key, idle_timeout_s=3600.0, send_timeout_s=3600.0)
+    async with gateway.running():
+        [listener] = gateway.face.listeners
+        handshakes, connections = listener._handshakes, listener._connections
+        assert handshakes is not None
+        assert connections is not None
+        EndedAtOnce.handshakes = handshakes
+        handshakes._protocol = lambda: EndedAtOnce(connections)
+        async with strangers(gateway, 1) as [(reader, writer)], asyncio.timeout(20):
+            received, to_send = ssl.MemoryBIO(), ssl.MemoryBIO()
+            trusting = ssl.create_default_context()
+            trusting.check_hostname, trusting.verify_mode = False, ssl.CERT_NONE
+            tls = trusting.wrap_bio(received, to_send)
+            while True:
+                try:
+                    tls.do_handshake()
+                    break
+                except ssl.SSLWantReadError:
+                    writer.write(to_send.read())
+                    received.write(await reader.read(65536))
+            writer.write(to_send.read())
+            with suppress(ConnectionError):
+                await reader.read()  # and says nothing more
+            while connections._live:  # noqa: ASYNC110 - a dictionary sets no event
+                await asyncio.sleep(0)
