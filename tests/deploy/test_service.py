@@ -16,6 +16,8 @@ REPOSITORY = Path(__file__).parents[2]
 FOLDER, CONFIGS = REPOSITORY / "deploy" / "systemd", REPOSITORY / "config"
 UNIT = FOLDER / "prostar-gateway.service"
 PROGRAM = "/opt/prostar-gateway/current/bin/prostar-gateway"
+CREDENTIALS = "CREDENTIALS_DIRECTORY=/proc/${MAINPID}/root%d"
+"""Where the check of a reload finds them: through the root of the gateway's own process."""
 DROP_INS = [(), ("low-ports.conf",), ("credentials.conf",), ("low-ports.conf", "credentials.conf")]
 WORST_EXPOSURE = 2.0
 
@@ -91,8 +93,9 @@ def test_a_reload_that_is_refused_fails(tmp_path: Path) -> None:
     """The signal goes out first, so that the gateway counts and logs it; systemd goes by the last exit status."""
     signal, check = settings(UNIT.name)["ExecReload"]
     assert signal == "/bin/kill -HUP $MAINPID"
-    program, _, arguments = check.partition(" ")
-    assert program == PROGRAM
+    before, program, arguments = check.partition(f" {PROGRAM} ")
+    assert program
+    assert before == f"/usr/bin/env {CREDENTIALS}"
     (started,) = settings(UNIT.name)["ExecStart"]
     assert arguments.split()[-2:] == started.split()[-2:]  # the same file
     for text, status in (((CONFIGS / "minimal.toml").read_text(), 0), ("site = 1\n", 78)):
@@ -100,6 +103,26 @@ def test_a_reload_that_is_refused_fails(tmp_path: Path) -> None:
         asked = [*GATEWAY, *arguments.split()[:-1], str(tmp_path / "site.toml")]
         done = subprocess.run(asked, capture_output=True, text=True, check=False)
         assert (done.returncode, done.stdout, bool(done.stderr)) == (status, "", status != 0)
+
+
+def test_a_reload_looks_for_credentials_where_the_gateway_has_them(tmp_path: Path) -> None:
+    """To all other processes of the unit systemd makes /run/credentials an empty folder that nobody may open."""
+    user = "\n".join(f'{key}_password_file = "noc.{key}"' for key in ("auth", "priv"))
+    (tmp_path / "site.toml").write_text(
+        f'{(CONFIGS / "minimal.toml").read_text()}\n[[snmp.user]]\nname = "noc"\n{user}\n'
+    )
+    handed_over = tmp_path / "credentials"
+    name, _, place = CREDENTIALS.replace("${MAINPID}", str(os.getpid())).replace("%d", str(handed_over)).partition("=")
+
+    def checked() -> int:
+        asked = [*GATEWAY, "check-config", "--quiet", "-c", str(tmp_path / "site.toml")]
+        return subprocess.run(asked, capture_output=True, check=False, env={**os.environ, name: place}).returncode
+
+    assert checked() == 78
+    handed_over.mkdir()
+    for key in ("auth", "priv"):
+        (handed_over / f"noc.{key}").write_text(f"{key} phrase of noc\n")
+    assert checked() == 0
 
 
 def test_it_opens_serial_ports_and_no_other_devices() -> None:
