@@ -151,16 +151,22 @@ def _watch(config: Path, line: str, seconds: float) -> Iterator[str]:
         except OSError as error:
             raise _Failed(f"the gateway cannot be asked at {path}: {error.strerror or error}") from None
         until = time.monotonic() + seconds
+        answered = False
         rest = b""
         while not stop.is_set and (left_s := until - time.monotonic()) > 0:
             if not select.select([sock], [], [], min(left_s, 0.2))[0]:
                 continue
-            data = sock.recv(65536)
+            data = b""
+            with suppress(ConnectionError):  # the gateway was killed
+                data = sock.recv(65536)
             if not data:
                 break
             *whole, rest = (rest + data).split(b"\n")
             for text in whole:
+                answered = True
                 yield _checked(text.decode())
+        if not answered:
+            raise _Failed(f"the gateway at {path} gives no answer")
 
 
 def _checked(text: str) -> str:
