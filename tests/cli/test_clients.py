@@ -6,10 +6,15 @@ import asyncio
 import json
 import socket
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from threading import Thread
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import NameOID
 from typer.testing import CliRunner
 
 from gateway.cli.app import app
@@ -139,6 +144,57 @@ def test_it_shows_the_token_of_the_configuration(tmp_path: Path) -> None:
         assert status == 1
         assert "401" in said
         assert "another-token" not in said
+    finally:
+        gateway.stop()
+
+
+def issued(name: str, by: tuple[x509.Name, ec.EllipticCurvePrivateKey] | None, folder: Path) -> str:
+    """Write a certificate and its key as NAME.pem and NAME.key; gives the text of the certificate."""
+    key, subject = ec.generate_private_key(ec.SECP256R1()), x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    issuer, signing = (subject, key) if by is None else by
+    now = datetime.now(UTC)
+    certificate = (
+        x509.CertificateBuilder(issuer, subject, key.public_key(), x509.random_serial_number())
+        .not_valid_before(now - timedelta(days=1))
+        .not_valid_after(now + timedelta(days=1))
+        .add_extension(x509.BasicConstraints(ca=name == "between", path_length=None), critical=True)
+        .sign(signing, hashes.SHA256())
+    )
+    private = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    (folder / f"{name}.key").write_bytes(private)
+    text = certificate.public_bytes(serialization.Encoding.PEM)
+    (folder / f"{name}.pem").write_bytes(text)
+    return text.decode()
+
+
+@pytest.mark.parametrize("kind", ["signed by itself", "issued", "issued, with its issuer"])
+def test_the_configured_certificate_is_enough(tmp_path: Path, kind: str) -> None:
+    """Such as one of a public authority, whose file ends with an issuer that is no root."""
+    authority = (
+        x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "authority")]),
+        ec.generate_private_key(ec.SECP256R1()),
+    )
+    if kind == "signed by itself":
+        issued("gateway", None, tmp_path)
+    elif kind == "issued":
+        issued("gateway", authority, tmp_path)
+    else:
+        between = issued("between", authority, tmp_path)
+        key = serialization.load_pem_private_key((tmp_path / "between.key").read_bytes(), None)
+        assert isinstance(key, ec.EllipticCurvePrivateKey)
+        by = (x509.load_pem_x509_certificate(between.encode()).subject, key)
+        (tmp_path / "gateway.pem").write_text(issued("gateway", by, tmp_path) + between)
+    files = f'tls_certificate = "{tmp_path / "gateway.pem"}"\ntls_private_key = "{tmp_path / "gateway.key"}"'
+    gateway = Running(tmp_path, more=files)
+    gateway.start()
+    try:
+        assert run("-c", str(gateway.config))[0::2] == (0, "")
+        issued("stranger", None, tmp_path)
+        (tmp_path / "gateway.pem").write_bytes((tmp_path / "stranger.pem").read_bytes())
+        status, _, said = run("-c", str(gateway.config))
+        assert (status, "certificate verify failed" in said) == (1, True)
     finally:
         gateway.stop()
 
