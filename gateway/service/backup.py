@@ -54,8 +54,11 @@ class Manifest:
 
 def back_up(state_dir: Path, site: str, target: Path, now: float) -> tuple[str, ...]:
     """Write what is in `state_dir` to a tar archive; gives the names in it. BackupError leaves no archive."""
+    if not target.name or target.is_dir():
+        raise BackupError(f"{target}: is a folder; an archive is a file")
     beside = target.with_name(target.name + ".new")
     try:
+        beside.unlink(missing_ok=True)  # of a backup that was killed
         with tempfile.TemporaryDirectory(prefix=".backup-", dir=target.parent) as folder:
             names = _collect(state_dir, Path(folder))
             text = json.dumps(asdict(Manifest(FORMAT, __version__, site, now)), ensure_ascii=False)
@@ -113,6 +116,8 @@ def _collect(state_dir: Path, folder: Path) -> tuple[str, ...]:
                 as_opened = [(path.name, os.fstat(file.fileno()).st_ino) for path, file in opened]
                 as_it_is = [(path.name, path.stat().st_ino) for path in _files(state_dir)]
             except FileNotFoundError:
+                if not state_dir.exists():
+                    raise
                 continue
             if as_opened != as_it_is:
                 continue

@@ -290,6 +290,22 @@ def test_a_backup_that_cannot_be_written_leaves_nothing(state: Path, tmp_path: P
     assert sorted(path.name for path in tmp_path.iterdir()) == ["state"]
 
 
+def test_why_there_is_no_backup_is_said(state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in (Path(), Path("/"), tmp_path):
+        with pytest.raises(BackupError, match="is a folder; an archive is a file"):
+            back_up(state, "ridge-07", folder, MADE)
+    with pytest.raises(BackupError, match=r"No such file or directory: .*no state"):
+        back_up(tmp_path / "no state", "ridge-07", tmp_path / "backup.tar", MADE)
+
+
+def test_what_a_killed_backup_left_hinders_no_other(state: Path, tmp_path: Path) -> None:
+    (tmp_path / "backup.tar.new").write_text("half of it")
+    back_up(state, "ridge-07", tmp_path / "backup.tar", MADE)
+    assert not (tmp_path / "backup.tar.new").exists()
+    assert "history.sqlite3" in members(tmp_path / "backup.tar")
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
 def test_restored_files_belong_to_whom_the_folder_belongs(state: Path, tmp_path: Path) -> None:
     archive, new = tmp_path / "backup.tar", tmp_path / "new"
