@@ -75,12 +75,16 @@ _WEAR = WearLimits()
 
 def _port(text: str) -> str:
     if "://" not in text:
-        if not text.startswith("/"):
+        if not text.startswith("/") or not text.isprintable():
             raise ValueError("no absolute path")
         return text
     parts = urlsplit(text)
-    if parts.scheme not in PORT_SCHEMES or not parts.hostname or parts.port is None or parts.path not in ("", "/"):
+    known = text.startswith(tuple(f"{scheme}://" for scheme in PORT_SCHEMES))
+    options = parts.fragment or (parts.query and parts.scheme == "tcp")  # of the others pyserial knows some
+    if not known or not parts.hostname or not parts.port or "@" in parts.netloc or parts.path not in ("", "/"):
         raise ValueError("not a known URL")
+    if options:
+        raise ValueError("options that nobody knows")
     return text
 
 
@@ -429,7 +433,7 @@ class Config(Table):
 
     site: Annotated[Name, Key(A_NAME, "The site's name, shown on every face.")]
     state_dir: Annotated[
-        Annotated[str, Field(pattern=r"^/")],
+        Annotated[str, Field(pattern=r"^/[^\x00-\x1f]*$")],
         Key("an absolute path", "Where the gateway keeps what must outlive it, such as the write ledger."),
     ] = "/var/lib/prostar-gateway"
     line: Annotated[

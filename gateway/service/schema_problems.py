@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import ipaddress
 import re
 from collections.abc import Iterable
 from typing import get_args
@@ -11,6 +12,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from gateway.service.keys import NETWORKS
 from gateway.service.problems import Path, Problem, show, show_file
 from gateway.service.schema import Config, Key, Table
 
@@ -25,6 +27,8 @@ _WRONG_TYPE = {
     "finite_number": "is not a finite number",
 }
 _NAMES_A_FILE = re.compile(r"_file$|^tls_")
+_ABOVE_ALL = ("site", "state_dir")
+"""The keys of no table: in TOML what is written below a table belongs to it."""
 _OUT_OF_RANGE = ("greater_than_equal", "less_than_equal", "greater_than", "less_than")
 
 
@@ -66,7 +70,8 @@ def _text(error: ErrorDetails) -> str:
     if kind == "extra_forbidden":
         return _unknown(path)
     key = key_at(path)
-    allowed = f"; allowed: {key.allowed}" if key else ""
+    hint = _network_meant(key, value) if kind == "value_error" else ""
+    allowed = f"; {hint}allowed: {key.allowed}" if key else ""
     if kind == "missing":
         return f"is missing{allowed}"
     name = next((part for part in reversed(path) if isinstance(part, str)), "")
@@ -79,11 +84,23 @@ def _text(error: ErrorDetails) -> str:
     return f"{shown} {_WRONG_TYPE.get(kind, 'is not allowed')}{allowed}"
 
 
+def _network_meant(key: Key | None, value: object) -> str:
+    """A hint at the network that an address with a length is in, which many write for it."""
+    if key is None or not key.allowed.startswith(NETWORKS) or not isinstance(value, str):
+        return ""
+    try:
+        return f'did you mean "{ipaddress.ip_network(value, strict=False)}"? '
+    except ValueError:
+        return ""
+
+
 def _unknown(path: Path) -> str:
     table = table_at(path[:-1])
     keys = tuple(table.model_fields) if table else ()
     near = difflib.get_close_matches(str(path[-1]), keys, n=1)
     hint = f'did you mean "{near[0]}"? ' if near else ""
+    if len(path) > 1 and not near and path[-1] in _ABOVE_ALL:
+        hint = "it stands above the first [table]; "
     return f"unknown key; {hint}allowed: {', '.join(keys)}"
 
 

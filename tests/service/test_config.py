@@ -255,6 +255,31 @@ listen = ["127.0.0.1:70000"]
             'modbus.listen[0]: "::1:1502" is not allowed; allowed: a list of',
         ),
         (
+            MINIMAL + '[modbus]\nallow = ["192.168.1.10/24"]\n',
+            'modbus.allow[0]: "192.168.1.10/24" is not allowed; did you mean "192.168.1.0/24"? allowed: a list of',
+        ),
+        (
+            MINIMAL + 'state_dir = "/srv/gateway"\n',
+            "line[0].device[0].state_dir: unknown key; it stands above the first [table]; allowed: name, address,",
+        ),
+        (f"x = {'[' * 9999}{']' * 9999}\n{MINIMAL}", "not TOML that can be read: "),
+        (replaced("unit_id = 11", f"unit_id = {'9' * 9999}"), "not TOML that can be read: "),
+        (
+            'state_dir = "/tmp/\\u0000"\n' + MINIMAL,
+            'state_dir: "/tmp/\\u0000" is not allowed; allowed: an absolute path',
+        ),
+        (
+            replaced('"/dev/serial/by-id/usb-a"', '"/dev/\\u0000"'),
+            'line[0].port: "/dev/\\u0000" is not allowed; allowed:',
+        ),
+        (
+            replaced('"/dev/serial/by-id/usb-a"', '"tcp://host:0"'),
+            'line[0].port: "tcp://host:0" is not allowed; allowed:',
+        ),
+        (replaced('"/dev/serial/by-id/usb-a"', '"TCP://host:502"'), 'line[0].port: "TCP://host:502" is not allowed;'),
+        (replaced('"/dev/serial/by-id/usb-a"', '"tcp://me:x@host:502"'), "line[0].port: "),
+        (replaced('"/dev/serial/by-id/usb-a"', '"tcp://host:502?timeout=3"'), "line[0].port: "),
+        (
             MINIMAL + '[modbus]\nallow = ["nas"]\n',
             'modbus.allow[0]: "nas" is not allowed; allowed: a list of addresses',
         ),
@@ -461,6 +486,19 @@ def test_a_file_that_is_no_text(tmp_path: Path, content: bytes | None, expected:
         path.write_bytes(content)
     with pytest.raises(ConfigError, match=expected):
         load_config(path)
+
+
+def test_the_mark_of_utf_8_in_front_is_no_matter(tmp_path: Path) -> None:
+    """Editors on Windows put it there."""
+    path = tmp_path / "c.toml"
+    path.write_text(MINIMAL.lstrip().replace("\n", "\r\n"), encoding="utf-8-sig", newline="")
+    assert path.read_bytes()[:3] == b"\xef\xbb\xbf"
+    assert load_config(path) == parse_config(MINIMAL)
+
+
+@pytest.mark.parametrize("port", ["rfc2217://host:1?logging=debug", "socket://[::1]:1", "tcp://[2001:db8::7]:502/"])
+def test_a_port_that_can_be_is_allowed(port: str) -> None:
+    assert parse_config(replaced("/dev/serial/by-id/usb-a", port)).line[0].port == port
 
 
 def test_a_folder_is_no_file(tmp_path: Path) -> None:
