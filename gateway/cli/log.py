@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
+from io import TextIOWrapper
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
@@ -88,6 +89,8 @@ def _moment(text: str | None, option: str, *, end: bool = False) -> float | None
 
 
 def _export(reader: HistoryReader, form: LogFormat, selection: Selection, site: str) -> None:
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(encoding="utf-8")  # as JSON and OpenMetrics are, whatever this terminal has
     with _bar(rows_to_read(reader, form, selection)) as progress:
         for piece in export(reader, form, selection, site, progress):
             sys.stdout.write(piece)

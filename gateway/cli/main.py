@@ -6,8 +6,10 @@ file imports nothing but the standard library before the handlers stand.
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
+from io import TextIOWrapper
 from types import FrameType
 
 UNTIL_STOPPED = ("run", "demo", "simulate", "replay")
@@ -18,6 +20,7 @@ def main() -> None:
     """Run the command line."""
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _leave)
+    _mend_streams()
     if sys.argv[1:2] == ["run"]:
         from gateway.cli.running import plain_arguments, run  # noqa: PLC0415 - only now are signals handled
 
@@ -27,6 +30,20 @@ def main() -> None:
     from gateway.cli.app import app  # noqa: PLC0415 - as above
 
     app(prog_name="prostar-gateway")
+
+
+def _mend_streams() -> None:
+    """Have 0, 1 and 2 lead somewhere, and no letter end a command that standard output has no code for.
+
+    Were one of them closed, the next socket or file would have its number, and what is printed would go there.
+    """
+    while (fd := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(fd, True)
+    os.close(fd)
+    if sys.stderr is None:
+        sys.stderr = open(2, "w", closefd=False, encoding="utf-8", errors="backslashreplace")  # noqa: SIM115 - for good
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _leave(number: int, _frame: FrameType | None) -> None:

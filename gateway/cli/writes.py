@@ -37,7 +37,7 @@ def command(
     found = [entry for entry in found if unit in {None, entry.intent.unit_id}][-last:]
     if as_json:
         for entry in found:
-            print(json.dumps(asdict(entry), ensure_ascii=False))
+            print(json.dumps(asdict(entry)))
         return
     if not found:
         print(f"No writes are noted in {folder}.")
