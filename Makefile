@@ -105,9 +105,9 @@ clean: ## Remove .venv and everything that was made by a tool.
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Whether `make PYTHON=...` names another interpreter than .venv was made with: then that environment is made anew.
-WHICH_PYTHON := import sys; print(sys.version, sys.base_prefix)
 ifneq ($(PYTHON),)
-  ifneq ($(shell "$(PYTHON)" -c '$(WHICH_PYTHON)' 2>&1),$(shell "$(BIN)/python" -c '$(WHICH_PYTHON)' 2>&1))
+  which_python = $(shell exec 2>/dev/null; "$(1)" -c 'import sys; print(sys.version, sys.base_prefix)')
+  ifneq ($(call which_python,$(PYTHON)),$(call which_python,$(BIN)/python))
     .PHONY: $(BIN)/python
     ANOTHER_PYTHON := $(BIN)/python
   endif

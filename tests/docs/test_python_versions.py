@@ -42,6 +42,11 @@ def clone(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def ask_make(clone: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {"PATH": "/usr/bin:/bin"}  # no MAKEFLAGS of a `make test` above
+    return subprocess.run(["make", *arguments], cwd=clone, env=environment, capture_output=True, text=True, check=False)
+
+
 @pytest.mark.parametrize("environment", [".venv/.dev", ".venv/.runtime", ".venv-audit/.ready"])
 @pytest.mark.parametrize(
     ("named", "current"), [((), True), (("PYTHON=./old",), True), (("PYTHON=./new",), False), (("PYTHON=./no",), False)]
@@ -49,10 +54,12 @@ def clone(tmp_path: Path) -> Path:
 def test_another_python_is_not_taken_for_the_one_that_is_there(
     clone: Path, environment: str, named: tuple[str, ...], current: bool
 ) -> None:
-    asked = subprocess.run(
-        ["make", "--question", *named, environment],
-        cwd=clone,
-        env={"PATH": "/usr/bin:/bin"},  # no MAKEFLAGS of a `make test` above
-        check=False,
-    )
-    assert asked.returncode == (0 if current else 1)
+    asked = ask_make(clone, "--question", *named, environment)
+    assert (asked.returncode, asked.stderr) == (0 if current else 1, "")
+
+
+def test_a_python_that_is_named_in_a_fresh_clone_is_taken_without_a_word(clone: Path) -> None:
+    shutil.rmtree(clone / ".venv")
+    told = ask_make(clone, "--dry-run", "PYTHON=./new", "setup")
+    assert (told.returncode, told.stderr) == (0, "")
+    assert "in ./new;" in told.stdout
