@@ -6,7 +6,8 @@
 3. Of an inform the receiver is. It is asked who it is by a message in clear, and what time it has by one that is signed
    and too old; both answers are reports, and the second one must be signed itself. After that its time is ours to keep.
 4. An answer counts only when its message id is one that we sent. What a report in clear can do is to make us learn an
-   engine id, with which a stranger can do nothing: it does not know the pass phrases.
+   engine id, with which a stranger can do nothing: it does not know the pass phrases. That takes milliseconds, so each
+   message of ours has one such answer.
 """
 
 from __future__ import annotations
@@ -148,10 +149,10 @@ class InformChannel:
         if request_id is None or message.model != v3.USER_BASED:
             return None
         if not message.flags & v3.AUTH:
-            return self._in_clear(message, request_id)
+            return self._in_clear(message, message_id, request_id)
         return self._signed(message, message_id, request_id, now)
 
-    def _in_clear(self, message: v3.Message, request_id: int) -> Heard | None:
+    def _in_clear(self, message: v3.Message, message_id: int, request_id: int) -> Heard | None:
         data = message.data
         if message.flags & v3.PRIV:
             return None
@@ -162,6 +163,7 @@ class InformChannel:
             return Heard(request_id, again=True)
         if not 5 <= len(message.engine_id) <= 32:  # RFC 3411, SnmpEngineID
             return None
+        del self._outstanding[message_id]
         self._engine_id = message.engine_id
         self._user = LocalUser(self._credentials, message.engine_id)
         self._sealer = v3.Sealer(self._user)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.faces.snmp import reader, v3, wire
+from gateway.faces.snmp import notify_security, reader, v3, wire
 from gateway.faces.snmp.counters import SnmpCounters
 from gateway.faces.snmp.engine import Engine
 from gateway.faces.snmp.notify_pdu import INFORM
@@ -17,6 +17,7 @@ from gateway.faces.snmp.notify_security import CommunityChannel, Heard, InformCh
 from gateway.faces.snmp.reader import NotSnmp
 from gateway.faces.snmp.secret import Secret
 from gateway.faces.snmp.security import Rejected, Security
+from gateway.faces.snmp.usm import Credentials, LocalUser
 from tests.faces.snmp.poller import credentials
 
 ENGINE_ID = b"\x80\x00\x00\x00\x05receiver"
@@ -144,6 +145,23 @@ def test_a_report_in_clear_teaches_an_engine_id_and_nothing_else() -> None:
         assert channel.heard(forged, 0.0) is None
     answer = receiver.take(channel.seal(REQUEST, pdu(INFORM), 0.0), 0.0)
     assert channel.heard(answer, 0.0) == Heard(REQUEST, acknowledged=True)
+
+
+def test_a_message_of_ours_teaches_one_engine_id(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It costs the loop milliseconds to learn one, so who is told of one thing cannot have us learn without end."""
+    learned: list[bytes] = []
+
+    def make(secret: Credentials, engine_id: bytes) -> LocalUser:
+        learned.append(engine_id)
+        return LocalUser(secret, engine_id)
+
+    monkeypatch.setattr(notify_security, "LocalUser", make)
+    channel = InformChannel(credentials())
+    question = channel.seal(REQUEST, pdu(INFORM), 0.0)
+    engine_ids = [b"\x80\x00\x00\x00\x05%d" % number for number in range(20)]
+    for engine_id in engine_ids:
+        channel.heard(Receiver(engine_id).take(question, 0.0), 0.0)
+    assert learned == engine_ids[:1]
 
 
 def test_an_inform_by_community_is_acknowledged_by_a_response_of_that_community() -> None:
