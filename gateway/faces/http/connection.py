@@ -3,7 +3,8 @@
 Rule 1: who sends no whole head within `idle_timeout_s`, or no further request, is closed; so is who does not take a
         reply to the end within `send_timeout_s`.
 Rule 2: at most `max_connections` are kept. When one more comes, the one that has been open longest and has no request
-        under way makes room. Where all have one, as many more are let in three times over, and no more than that.
+        under way makes room. Where all have one, as many more are let in three times over; then, of those whose clients
+        do not take their replies, the one that has been open longest makes room; where there is none, the newcomer.
 Rule 3: while a request is under way nothing more is read than one further head. A head that comes in pieces is looked
         at when its end has come, and else not before it is twice as long as it was.
 Rule 4: a handler that fails costs its own connection: 500, counted and logged.
@@ -57,7 +58,8 @@ class Connections:
                 if surplus == 0:
                     break
         if len(self._live) >= BUSY_FACTOR * self.settings.max_connections:
-            connection.abort()
+            stalled = (other for other in staying if other.stalled and not other.aborted)
+            next(stalled, connection).abort()
             self.stats.closed_for_room += 1
         self._live[connection] = None
 
@@ -102,6 +104,11 @@ class Connection(asyncio.Protocol):
     def busy(self) -> bool:
         """Whether a request is under way."""
         return self._task is not None
+
+    @property
+    def stalled(self) -> bool:
+        """Whether its client has not taken what was sent."""
+        return self._full
 
     @property
     def local(self) -> tuple[str, int]:

@@ -12,7 +12,7 @@ from contextlib import asynccontextmanager
 import pytest
 
 from gateway.faces.http import connection as connection_module
-from gateway.faces.http.connection import BUSY_FACTOR
+from gateway.faces.http.connection import BUSY_FACTOR, Connection
 from gateway.faces.http.request import Reply, Request
 from gateway.faces.http.wire import HEAD_BYTES, Head, Refusal, take
 
@@ -213,6 +213,36 @@ async def test_who_makes_room_is_counted_once_however_many_come_in_a_turn(gatewa
     assert [each.aborted for each in made] == [True] * more + [False] * most
     for connection in made:
         connection.connection_lost(None)
+
+
+async def test_where_all_are_busy_one_that_takes_no_reply_makes_room(
+    make_gateway: MakeGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who asks for much and does not read it is busy for as long as he likes, and would keep everybody out."""
+    async with make_gateway(max_connections=1).running() as gateway, waiting(gateway, monkeypatch):
+        connections = gateway.face.listeners[0]._connections
+        assert connections is not None
+
+        def came() -> Connection:
+            connection = connections()
+            connection.connection_made(Ending())
+            connection.data_received(get("/wait"))
+            return connection
+
+        made = [came() for _ in range(BUSY_FACTOR)]
+        for connection in made[1:3]:
+            connection.pause_writing()
+        made[1].resume_writing()
+        newcomers = [came(), came()]
+        assert [each.aborted for each in (*made, *newcomers)] == [False, False, True, False, False, True]
+        assert gateway.face.stats.closed_for_room == 2
+        made[1].pause_writing()
+        made[2].connection_lost(None)
+        newcomers[1].connection_lost(None)
+        assert not came().aborted
+        assert made[1].aborted
+        for connection in tuple(connections._live):
+            connection.connection_lost(None)
 
 
 async def test_stopping_lets_a_reply_under_way_go_out(
