@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import queue
 import re
@@ -34,8 +35,16 @@ ALL_DEVICES = (*MIXED_DEVICES, ("hilltop", "array-5", 1, 15))
 MODELS: Mapping[str, str] = {"array-4": "tristar-mppt", "array-5": "tristar-mppt"}
 
 
+PR_SET_PDEATHSIG = 1
+_PRCTL = ctypes.CDLL(None).prctl
+"""Known before the first fork: nothing may be loaded between that and exec."""
+
+
 class Program:
-    """A running process whose standard error can be waited for, line by line."""
+    """A running process whose standard error can be waited for, line by line.
+
+    It ends with the thread that started it, however that ends: of tests that are killed nothing is left.
+    """
 
     def __init__(self, arguments: Sequence[str], **variables: str) -> None:
         """`variables` are added to the environment."""
@@ -47,6 +56,7 @@ class Program:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             start_new_session=True,
+            preexec_fn=lambda: _PRCTL(PR_SET_PDEATHSIG, signal.SIGTERM),  # noqa: PLW1509 - one system call
         )
         self.seen: list[str] = []
         self._lines: queue.Queue[str | None] = queue.Queue()
