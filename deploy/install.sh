@@ -11,6 +11,7 @@
 # change of release is one rename. A release that refuses your configuration is not switched to, and one that does not
 # start is switched back. Your configuration is never changed. DESTDIR=DIR puts everything below DIR (tests, images).
 set -euo pipefail
+umask 022  # the service is not root, and has to read what root puts into place
 
 clone=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 root=${DESTDIR:-}

@@ -50,6 +50,7 @@ def install(clone: Path, destination: Path, *arguments: str) -> subprocess.Compl
         text=True,
         check=False,
         env={**os.environ, "DESTDIR": str(destination), "PYTHON": sys.executable},
+        umask=0o077,  # as root has it on machines that are kept tight
     )
 
 
@@ -116,6 +117,9 @@ def test_from_installation_to_removal(
     assert all((machine / path).exists() for path in PLACED)
     assert config.read_text() == (ROOT / "config" / "minimal.toml").read_text()
     assert "is right" in gateway("check-config", "-c", str(config))
+    placed = [path for path in machine.rglob("*") if not path.is_symlink()]
+    shut = [path for path in placed if ~path.stat().st_mode & (0o005 if path.is_dir() else 0o004)]
+    assert shut == [], "the service is not root"
     first = home.joinpath("current").resolve()
     assert (first / "share" / "prostar-gateway" / "docs" / "install.md").is_file()
     unit = (machine / PLACED[0]).read_text()
