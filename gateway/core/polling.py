@@ -2,11 +2,12 @@
 
 Rule 1: live blocks as often as asked (at night more seldom, where configured), settings seldom; who the device is
         once after each start. The line decides what is possible (scheduler.py).
-Rule 2: a block refused with exception 02 or 03 is split in two, and the split is remembered.
+Rule 2: a block refused with exception 02 or 03 is split in two, and the split is remembered. What cannot be split is
+        asked again every ten minutes; when it is there after all, everything is planned anew.
 Rule 3: a device is online once each of its live blocks was read since the line was opened or the device came back
         and it proved to be the unit that is expected there (identity.py), and while no live block was missed
-        three times in a row. It is stale when one was, or when the line is down; offline from the moment its
-        breaker opens until it is online again.
+        three times in a row. It is stale when one was, when it refuses all of them, or when the line is down; offline
+        from the moment its breaker opens until it is online again.
 Rule 4: a unit that is not the expected one is not shown and not asked for anybody; it is looked at again
         every minute, as if it had just come: nothing is kept of what was read of it before.
 Rule 5: blocks that the unit's product does not have, by its map, are not asked for once it told its product.
@@ -41,6 +42,7 @@ from gateway.modbus.transactions import Replied
 log = logging.getLogger(__name__)
 
 LOOK_AGAIN_S = 60.0
+REFUSED_AGAIN_S = 600.0
 ASK_AGAIN_S = 5.0
 """How often a device of no known model is asked who it is."""
 
@@ -128,6 +130,8 @@ class Polling:
             period_s = max(period_s, LOOK_AGAIN_S)
             if item is _first_live(record):
                 self._look_again(record, item, now)
+        if item.refused:
+            period_s = max(period_s, _refused_again_s(item, record))
         item.due = now + period_s
 
     def replied(self, item: PollItem, record: DeviceRecord, event: Replied, now: float) -> None:
@@ -139,6 +143,8 @@ class Polling:
             block = item.block
             item.fresh = True
             record.store(Block(block.space, block.first, block.count, event.pdu[2:], event.sent_at), now)
+            if item.refused:
+                self._plan_anew(record, now)
         elif item.purpose is Purpose.IDENTIFY:
             objects = parse_identification(event.pdu).objects
             texts = (objects.get(number, b"").decode("ascii", "replace").strip("\0 ") for number in range(3))
@@ -169,9 +175,8 @@ class Polling:
             return
         item.misses += 1
         item.device.stats.failures += 1
-        if code not in _REFUSALS_TO_SPLIT or item.period_s is None or item not in record.polls.items:
+        if code not in _REFUSALS_TO_SPLIT or item.period_s is None or item.refused or item not in record.polls.items:
             return
-        record.polls.items.remove(item)
         record.polls.refused(block.space, block.count)
         record.forget(block.space, block.first, block.last + 1)
         halves = split(block, item.device.map)
@@ -184,7 +189,14 @@ class Polling:
             code,
             "dropped" if halves is None else "split",
         )
-        if halves is not None:
+        if halves is None:
+            item.refused = True
+            item.due = now + REFUSED_AGAIN_S
+            first = _first_live(record)
+            if first is not None and first.refused:
+                first.due = min(first.due, now + LOOK_AGAIN_S)
+        else:
+            record.polls.items.remove(item)
             record.polls.items += [_poll_item(item.device, half, item.period_s, now) for half in halves]
 
     def failed(self, item: PollItem, record: DeviceRecord, now: float) -> None:
@@ -213,7 +225,7 @@ class Polling:
             return DeviceState.OFFLINE
         complete = bool(live) and all(item.fresh and item.misses == 0 for item in live)
         if record.state is DeviceState.ONLINE:
-            if any(item.misses >= MISSES_TO_OPEN for item in live):
+            if not live or any(item.misses >= MISSES_TO_OPEN for item in live):
                 return DeviceState.STALE
             if complete:
                 record.known = record.known.learned(record.seen())
@@ -265,6 +277,16 @@ class Polling:
             what = "serial number" if item.purpose is Purpose.SERIAL_NUMBER else "product"
             log.warning('event=identity_untold device=%s what="%s"', record.device.name, what)
 
+    def _plan_anew(self, record: DeviceRecord, now: float) -> None:
+        """Rule 2: what was learnt of the device's limits holds no more."""
+        asked = [item for item in record.polls.items if item.block is None]
+        blocks = [item for item in self.first(record.device, now) if item.block is not None]
+        record.polls.most.clear()
+        record.polls.items = sorted(blocks + asked, key=_rank)
+        identification = record.device.snapshot.identification
+        if identification is not None:
+            self._keep_what_it_has(record, identification.product)
+
     def _find(self, item: PollItem, record: DeviceRecord, product: str, now: float) -> None:
         """Rule 7."""
         item.fresh = True
@@ -307,7 +329,7 @@ def _shows_life(item: PollItem) -> bool:
     """Whether its replies say that the device is there: live blocks, or who it is where nothing else is known."""
     if item.block is None:
         return item.purpose is Purpose.IDENTIFY and item.period_s is not None
-    return item.block.poll is PollClass.LIVE
+    return item.block.poll is PollClass.LIVE and not item.refused
 
 
 def _is_expected(item: PollItem, record: DeviceRecord) -> bool:
@@ -316,7 +338,15 @@ def _is_expected(item: PollItem, record: DeviceRecord) -> bool:
 
 
 def _first_live(record: DeviceRecord) -> PollItem | None:
-    return next((i for i in record.polls.items if i.block is not None and i.block.poll is PollClass.LIVE), None)
+    """The first live block, of those that are not refused if there are any."""
+    live = [i for i in record.polls.items if i.block is not None and i.block.poll is PollClass.LIVE]
+    return min(live, key=lambda item: item.refused, default=None)
+
+
+def _refused_again_s(item: PollItem, record: DeviceRecord) -> float:
+    """When it is asked again; of a device that refuses everything one thing is enough to know it by."""
+    first = _first_live(record)
+    return LOOK_AGAIN_S if item is first and item.refused else REFUSED_AGAIN_S
 
 
 def _poll_item(device: Device, block: PlannedBlock, period_s: float, due: float) -> PollItem:

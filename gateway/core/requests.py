@@ -167,6 +167,7 @@ class PollItem:
     early_at: float = -math.inf  # when it was last brought forward
     under_way: bool = False
     again: bool = False  # as of `ReadTurn`
+    refused: bool = False  # the device says that it has no such thing: asked again in a while
 
     @property
     def optional(self) -> bool:
