@@ -18,9 +18,11 @@ from gateway.core.health import Breaker
 from gateway.core.identity import Identity
 from gateway.core.scheduler import PollList
 from gateway.core.site import Device
-from gateway.core.snapshot import Block, DeviceState, Snapshot
+from gateway.core.snapshot import Block, DeviceState, Snapshot, holds
+from gateway.devices.codecs import read_words
 from gateway.devices.decode import Decoder
-from gateway.devices.model import DeviceMap, Identification, Space, Value
+from gateway.devices.model import DeviceMap, Identification, Point, Space, Value
+from gateway.devices.texts import words_of
 
 HEARD_S = 0.05
 
@@ -33,6 +35,12 @@ def _decoder(device: Device) -> Decoder:
     return Decoder(
         device.map, {name: chosen for name, chosen in device.decode.items() if chosen in readings.get(name, ())}
     )
+
+
+def _keepers(device_map: DeviceMap) -> tuple[tuple[str, Point], ...]:
+    """The growing counters of a model that its memory keeps, and the points that they are kept in."""
+    growing = device_map.identity.growing
+    return tuple((rule.point, device_map.point(rule.stored)) for rule in growing if rule.stored is not None)
 
 
 class _Times(Mapping[str, float]):
@@ -82,8 +90,10 @@ class DeviceRecord:
         self.live_started_at: float | None = None
         self.doubt = Doubt()
         self._decoder = _decoder(device)
+        self._keepers = _keepers(device.map)
         self._blocks: list[Block] = []  # no address is in two of them
         self._scaling: dict[str, Value] = {}  # what the device last told of it, since the line was opened
+        self._stored: tuple[Mapping[str, tuple[Value, ...]], float] = ({}, 0.0)  # as of `Identity`
         device.snapshot = Snapshot(state_since=now)
 
     @property
@@ -107,6 +117,7 @@ class DeviceRecord:
         snapshot = self.device.snapshot
         identification = snapshot.identification
         growing = self.device.map.identity.growing
+        stored, stored_at = self._stored
         counters = {rule.point: self.values[rule.point] for rule in growing if rule.point in self.values}
         return Identity(
             product=None if identification is None else identification.product,
@@ -114,6 +125,8 @@ class DeviceRecord:
             serial_number=snapshot.serial_number,
             counters=counters,
             at=max((snapshot.read_at[point] for point in counters), default=0.0),
+            stored=stored,
+            stored_at=stored_at,
         )
 
     def store(self, block: Block, now: float) -> None:
@@ -129,6 +142,9 @@ class DeviceRecord:
                 self._decode(each, values, texts)
         self.device.stats.implausible = self._decoder.implausible
         self._show(values, texts, last_reply_at=now)
+        stored = self._kept_in(block)
+        if stored:
+            self._stored = ({**self._stored[0], **stored}, block.read_at)
 
     def forget(self, space: Space, first: int, end: int) -> None:
         """Drop what was read of these addresses: it was written, or is no longer read as one block."""
@@ -152,6 +168,7 @@ class DeviceRecord:
         """The device, whose model was to be found, is of this one."""
         self.device.map = device_map
         self._decoder = _decoder(self.device)
+        self._keepers = _keepers(device_map)
 
     def restart(self) -> None:
         """Another unit may stand there now: nothing of the old one is kept but what is known of its identity."""
@@ -159,6 +176,7 @@ class DeviceRecord:
         self.live_started_at = None
         self._blocks = []
         self._scaling.clear()
+        self._stored = ({}, 0.0)
         self._publish(identification=None, serial_number=None)
 
     def warn(self, warning: str, *, on: bool) -> bool:
@@ -175,6 +193,17 @@ class DeviceRecord:
         lasted_s = now - self.device.snapshot.state_since
         self._publish(state=state, state_since=now)
         return lasted_s
+
+    def _kept_in(self, block: Block) -> dict[str, tuple[Value, ...]]:
+        """The growing counters that the unit's memory keeps in this block, by all readings that there are."""
+        found = {}
+        for counter, point in self._keepers:
+            if holds(block, point):
+                at = 2 * (point.address - block.first)
+                words = words_of(block.data[at : at + 2 * point.words])
+                values = (read_words(reading, words) for reading in point.readings)
+                found[counter] = tuple(value for value in values if value is not None)
+        return found
 
     def _without(self, space: Space, first: int, end: int) -> tuple[dict[str, Value], dict[str, str]]:
         """Drop the blocks that have one of these addresses; gives the values and texts of the others."""

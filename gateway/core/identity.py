@@ -7,7 +7,9 @@ one can rely on, so counters are compared that only grow, and no faster than tim
 Rule 1: what was configured, and else what was seen first, is expected; what a unit does not tell is not compared.
 Rule 2: a counter is right between its last value and that plus what the time since can have added. A counter that
         a command clears is also right from zero up to that growth.
-Rule 3: two units whose counters fit by chance are not told apart. Configure the serial number where there is one.
+Rule 3: a unit that was without power goes on from what its memory kept, once a day. So its counters are right, too, if
+        all of them go on from what was last seen there, or from what can have been stored since.
+Rule 4: two units whose counters fit by chance are not told apart. Configure the serial number where there is one.
 """
 
 from __future__ import annotations
@@ -23,13 +25,19 @@ SLACK_UNITS = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What is known of a unit. None and missing counters are not compared; `at` is when the counters were read."""
+    """What is known of a unit. None and missing counters are not compared.
+
+    `at` is when the counters were read, `stored_at` when those in the memory were; of these there may be several
+    readings, one of which is right.
+    """
 
     product: str | None = None
     revision: str | None = None
     serial_number: str | None = None
     counters: Mapping[str, Value] = field(default_factory=dict)
     at: float = 0.0
+    stored: Mapping[str, tuple[Value, ...]] = field(default_factory=dict)
+    stored_at: float = 0.0
 
     @property
     def expects(self) -> bool:
@@ -45,16 +53,31 @@ class Identity:
         ):
             if expected and found and expected != found:
                 return f"{what} is {found}, expected {expected}"
-        hours = max(0.0, seen.at - self.at) / 3600
-        for rule in growing:
-            before, after = self.counters.get(rule.point), seen.counters.get(rule.point)
-            if before is None or after is None:
-                continue
-            growth = rule.per_hour * hours + SLACK_UNITS
-            cleared = rule.clearable and 0 <= after <= growth
-            if not cleared and not before <= after <= before + growth:
-                return f"{rule.point} is {after:g}, expected {before:g} to {before + growth:g}"
+        complaints = [self._misfit(rule, seen) for rule in growing]
+        if any(complaints) and not all(self._goes_on(rule, seen) for rule in growing):
+            return next(filter(None, complaints))
         return None
+
+    def _misfit(self, rule: Growing, seen: Identity) -> str | None:
+        """Rule 2."""
+        before, after = self.counters.get(rule.point), seen.counters.get(rule.point)
+        if before is None or after is None:
+            return None
+        growth = _growth(rule, self.at, seen.at)
+        cleared = rule.clearable and 0 <= after <= growth
+        if cleared or before <= after <= before + growth:
+            return None
+        return f"{rule.point} is {after:g}, expected {before:g} to {before + growth:g}"
+
+    def _goes_on(self, rule: Growing, seen: Identity) -> bool:
+        """Rule 3; what is not stored, or not known to be, has to fit by rule 2."""
+        kept, after = self.stored.get(rule.point, ()), seen.counters.get(rule.point)
+        if not kept or after is None:
+            return self._misfit(rule, seen) is None
+        if rule.clearable:
+            kept = (*kept, 0)
+        growth = _growth(rule, self.stored_at, seen.at)
+        return any(before <= after <= before + growth for before in kept)
 
     def learned(self, seen: Identity) -> Identity:
         """This identity with what `seen` tells anew."""
@@ -65,4 +88,11 @@ class Identity:
             serial_number=self.serial_number or seen.serial_number,
             counters=seen.counters or self.counters,
             at=seen.at if seen.counters else self.at,
+            stored=seen.stored or self.stored,
+            stored_at=seen.stored_at if seen.stored else self.stored_at,
         )
+
+
+def _growth(rule: Growing, before: float, after: float) -> float:
+    """The most that a counter can have grown by between two moments."""
+    return rule.per_hour * max(0.0, after - before) / 3600 + SLACK_UNITS

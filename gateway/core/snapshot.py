@@ -41,6 +41,12 @@ class Block:
     read_at: float
 
 
+def holds(block: Block, point: Point) -> bool:
+    """Whether all of the point's words lie in the block."""
+    end = block.first + block.count
+    return block.space is point.space and block.first <= point.address and point.address + point.words <= end
+
+
 _NO_VALUES: Mapping[str, Value] = MappingProxyType({})
 _NO_TEXTS: Mapping[str, str] = MappingProxyType({})
 _NO_TIMES: Mapping[str, float] = MappingProxyType({})
@@ -73,11 +79,7 @@ class Snapshot:
 
     def block_of(self, point: Point) -> Block | None:
         """The block that the whole point was last read in, with a value or without; None when it was not read."""
-        end = point.address + point.words
-        for block in self.blocks:
-            if block.space is point.space and block.first <= point.address and end <= block.first + block.count:
-                return block
-        return None
+        return next((block for block in self.blocks if holds(block, point)), None)
 
     def shown_texts(self) -> Mapping[str, str]:
         """As `shown`, of the points that are texts."""

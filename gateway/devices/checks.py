@@ -200,6 +200,8 @@ def _rules(device_map: DeviceMap) -> Iterator[str]:
     for growing in device_map.identity.growing:
         if growing.point not in polled:
             yield f"identity: growing: no polled point {growing.point}"
+        if growing.stored is not None and growing.stored not in polled:
+            yield f"identity: growing: stored: no polled point {growing.stored}"
     if device_map.night is not None and device_map.night.point not in polled:
         yield f"night: no polled point {device_map.night.point}"
     for point in device_map.points:

@@ -260,9 +260,10 @@ class _Growing(_Form):
     point: Label
     per_hour: Annotated[Number, Field(gt=0)]
     clearable: bool = False
+    stored: Label | None = None
 
     def build(self) -> Growing:
-        return Growing(self.point, float(self.per_hour), self.clearable)
+        return Growing(self.point, float(self.per_hour), self.clearable, self.stored)
 
 
 class _Night(_Form):

@@ -273,6 +273,7 @@ class Growing:
     point: str
     per_hour: float
     clearable: bool  # a command sets it to zero
+    stored: str | None = None  # the point that keeps it for a unit without power, as it was some time ago
 
 
 @dataclass(frozen=True, slots=True)

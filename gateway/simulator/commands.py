@@ -6,7 +6,8 @@ map has points for):
 1. An EEPROM write is not verified. It raises "EEPROM setting edit" in both fault fields until a reset, or, from
    firmware 13 with setting_change_signal 1, the alarm "setting changed" instead.
 2. Set-only coils act when written with 1 and always read 0; clear_faults and clear_alarms leave what needs a reset.
-3. reset_control and factory_reset reboot the unit without an answer; RAM then begins with what EEPROM holds.
+3. reset_control and factory_reset reboot the unit without an answer; RAM then begins with what EEPROM holds, the
+   counters too, which are stored once in 24 hours and when force_eeprom_update says so.
    factory_reset also puts every setting back, the Modbus address included.
 4. Slave control (voltage; a TriStar has a current too) must be written again within the time in the map, else the unit
    faults; writing again ends the fault. What ends the control is in the map.
@@ -192,7 +193,7 @@ class Commands:
         self._day.orders.alarms &= self._labels.mask("alarms", "setting_changed")
 
     def _force_eeprom_update(self) -> None:
-        store_totals(self._memory)
+        store_totals(self._day, self._memory)
 
     def _clear_extremes(self) -> None:
         today, volts = self._day.today, self._day.now.battery_v

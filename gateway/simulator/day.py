@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import random
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from gateway.simulator.charger import CHARGING, Charger, ChargeStage, LoadOutput, LoadStage, Orders, Seen, SetPoints
 from gateway.simulator.plant import Battery, Plant, array_curve, load_wanted_a
@@ -138,6 +138,8 @@ class SolarDay:
     _sweep_at_s: float = field(init=False, default=0.0)
     _rts_day: int = field(init=False, default=-1)
     _rts_from_s: float = field(init=False, default=math.inf)
+    _kept: Totals = field(init=False)
+    _kept_hours: float = field(init=False)
 
     def __post_init__(self) -> None:
         self.sky = Sky(self.seed, self.plant.warmth_c)
@@ -149,6 +151,7 @@ class SolarDay:
         self.now.battery_v = self.now.battery_25s_v = self.now.battery_60s_v = rest_v
         self.now.ambient_c = self.now.heatsink_c = self.now.inductor_c = self.sky.ambient_c(0.0)
         self.advance(self.start_s)
+        self.keep()
 
     @property
     def hours(self) -> float:
@@ -166,10 +169,16 @@ class SolarDay:
         """What a remote sensor on the battery measures; it lags the air and follows the charge current."""
         return self.sky.ambient_c(self.at_s - 7200.0) + 0.06 * self.now.charge_a
 
+    def keep(self) -> None:
+        """Store the counters, as the unit does every 24 hours."""
+        self._kept = replace(self.totals)
+        self._kept_hours = self.hours
+
     def restart(self) -> None:
-        """Begin the stages again, as after a reset."""
+        """Begin the stages again, as after a reset; the counters go on from what was stored last."""
         self.charger.restart()
         self.load.restart()
+        self.totals = replace(self._kept, hours_before=self._kept_hours - self.at_s / 3600)
 
     def advance(self, to_s: float) -> bool:
         """Move to the last grid step not after `to_s`; whether anything changed."""

@@ -80,7 +80,7 @@ class SimulatedController(Controller):
         self._commands = Commands(self._memory, self.day, self._labels, firmware)
         self._commands.boot()
         self._publish()
-        store_totals(self._memory)
+        store_totals(self.day, self._memory)
 
     @property
     def memory(self) -> Memory:
@@ -211,7 +211,7 @@ class SimulatedController(Controller):
         for number in range(int(self.day.at_s // DAY_S) + 1, int(at_s // DAY_S) + 1):
             self.day.advance(number * DAY_S)
             self._publish()
-            store_totals(self._memory)
+            store_totals(self.day, self._memory)
         self._outdated |= self.day.advance(at_s)
 
     def _refresh(self) -> None:

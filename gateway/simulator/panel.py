@@ -75,8 +75,9 @@ def publish(day: SolarDay, memory: Memory, labels: Labels) -> None:
                 memory.set(name, _wrapped(value, memory.point(name)))
 
 
-def store_totals(memory: Memory) -> None:
+def store_totals(day: SolarDay, memory: Memory) -> None:
     """Copy the counters and extremes from RAM to EEPROM, as the unit does every 24 hours."""
+    day.keep()
     for stored, live in _STORED.items():
         value = memory.get(live)
         if value is not None:

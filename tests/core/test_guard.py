@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 
 from gateway.core.identity import Identity
+from gateway.core.settings import PollSettings
 from gateway.core.site import Outcome
 from gateway.core.snapshot import IDENTITY_MISMATCH, DeviceState
+from gateway.devices.model import Space
 from gateway.devices.schema import load_map
 from gateway.errors import IdentityUnproven
 from gateway.modbus.pdu import Function, ReadRequest, exception_reply
@@ -220,3 +222,60 @@ def test_another_unit_costs_the_line_one_look_a_minute(virtual_line: MakeLine) -
     used_s = line.engine.stats.busy_s
     line.run(600.0)
     assert line.engine.stats.busy_s - used_s < 0.02 * 600
+
+
+HALF_A_DAY = PollSettings(live_s=60.0, settings_s=300.0)
+RESET = 0xFF
+
+
+@pytest.mark.parametrize("model", ["prostar-mppt", "tristar-mppt"])
+@pytest.mark.parametrize("away_s", [0.0, 3600.0, 40 * 3600.0])
+def test_a_unit_that_lost_its_power_is_the_same_though_its_counters_went_back(
+    virtual_line: MakeLine, model: str, away_s: float
+) -> None:
+    """They go on from what EEPROM has, which is written once a day (both documents)."""
+    device_map = load_map(model)
+    unit = SimulatedController(device_map, seed=1, start_hour=6.0)
+    line = virtual_line(unit, poll=HALF_A_DAY, opened=False)
+    line.devices[0].map = device_map
+    line = VirtualLine(line.engine.settings, line.devices, line.wire, line.now)
+    line.engine.opened(line.now)
+    line.run(8 * 3600.0)
+    before = line.devices[0].snapshot.values["hourmeter"]
+    unit.write(Space.COILS, RESET, 1, line.now)
+    unit.silent = True
+    line.run(240.0)
+    assert state(line) is not DeviceState.ONLINE
+    line.engine.closed("unplugged", line.now)
+    line.now += away_s
+    line.engine.opened(line.now)
+    unit.silent = False
+    line.run(120.0)
+    assert not mismatch(line)
+    assert state(line) is DeviceState.ONLINE
+    after = line.devices[0].snapshot.values["hourmeter"]
+    assert after < before or away_s > 4 * 3600
+    line.run(3600.0)
+    line.engine.closed("unplugged", line.now)
+    line.engine.opened(line.now)
+    line.run(120.0)
+    assert state(line) is DeviceState.ONLINE, "it is known by its new counters from then on"
+
+
+@pytest.mark.parametrize("behind_ah", [-20.0, 5.0, 20.0, 40.0])
+def test_a_twin_of_the_same_age_is_no_unit_that_lost_its_power(virtual_line: MakeLine, behind_ah: float) -> None:
+    """Installed on the same day on a like array: only the charge differs, and by less than what a day brings."""
+    mine, twin = (SimulatedController(MAP, seed=seed, start_hour=6.0) for seed in (1, 4))
+    assert mine.plant == twin.plant
+    line = virtual_line(mine, poll=HALF_A_DAY)
+    twin.advance(line.now)
+    line.run(8.5 * 3600.0)
+    twin.advance(line.now)
+    assert mine.day.totals.charge_ah - line.devices[0].snapshot.values["stored_charge_total"] > 40.0
+    twin.day.totals.charge_ah = mine.day.totals.charge_ah - behind_ah
+    twin.day.totals.load_ah = mine.day.totals.load_ah
+    twin.memory.set("charge_total", twin.day.totals.charge_ah)
+    assert int(twin.day.hours) == int(mine.day.hours)
+    reopened(line, twin)
+    line.run(120.0)
+    assert mismatch(line)

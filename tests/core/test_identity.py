@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,6 +14,7 @@ from gateway.devices.model import Growing
 HOURS = Growing("hourmeter", 1.0, clearable=False)
 CHARGE = Growing("charge_total", 60.0, clearable=True)
 RULES = (HOURS, CHARGE)
+KEPT = {"hourmeter": (11985,), "charge_total": (4920.0, 322437120.0)}  # half a day ago, read a minute ago
 
 KNOWN = Identity("PS-MPPT-40", "v01.01.13", None, {"hourmeter": 12000, "charge_total": 5000.0}, at=1000.0)
 
@@ -28,6 +31,35 @@ def later(seconds: float, hourmeter: float, charge: float, **more: str) -> Ident
 
 def test_the_same_unit_a_minute_later() -> None:
     assert KNOWN.complaint(later(60, 12000, 5000.5), RULES) is None
+
+
+@pytest.mark.parametrize(
+    ("seen", "same"),
+    [
+        (later(3600, 11985, 4920.0), True),
+        (later(3600, 11986, 4979.0), True),  # an hour at 60 A
+        (later(3600, 11987, 5040.0), False),  # it cannot have run for so long
+        (later(3600, 11986, 4919.0), False),
+        (later(3600, 11986, 5045.0), False),
+        (later(3600, 11985, 5000.0), False),  # the hours of one moment, the charge of another
+        (later(3600, 12001, 4920.0), False),
+        (later(3600, 12001, 5030.0), True),  # it had power all the time
+        (later(3600, 11986, 0.0), True),  # and was cleared
+        (later(3600, 11984, 4920.0), False),
+    ],
+)
+def test_a_unit_that_had_no_power_goes_on_from_what_it_stored(seen: Identity, same: bool) -> None:
+    known = replace(KNOWN, stored=KEPT, stored_at=940.0)
+    assert (known.complaint(seen, RULES) is None) is same
+    if not same:
+        assert known.complaint(seen, RULES) == KNOWN.complaint(seen, RULES)
+
+
+def test_what_is_not_known_to_be_stored_has_to_fit_as_ever() -> None:
+    known = replace(KNOWN, stored={"hourmeter": (11985,)}, stored_at=940.0)
+    assert known.complaint(later(60, 11985, 5000.0), RULES) is None
+    assert known.complaint(later(60, 11985, 4920.0), RULES) is not None
+    assert known.learned(Identity(at=9e9)).stored == known.stored
 
 
 @pytest.mark.parametrize(
@@ -68,6 +100,17 @@ def test_what_was_configured_is_never_unlearned() -> None:
     assert learned.serial_number == "1"
     assert learned.counters == {"hourmeter": 5, "charge_total": 6.0}
     assert learned.learned(Identity(at=9e9)).at == learned.at
+
+
+@given(st.floats(0, 86400), st.floats(0, 1e7), st.floats(0, 1), st.floats(0, 1), st.floats(0, 1))
+def test_it_is_itself_too_when_it_lost_its_power_whenever_it_stored_last(
+    stored_s: float, outage_s: float, written: float, ran: float, sun: float
+) -> None:
+    """What it goes on from was written at some time between our last look at it and the last of its power."""
+    known = replace(KNOWN, stored={"hourmeter": (11990,), "charge_total": (4900.0,)}, stored_at=1000.0 - stored_s)
+    hours, ran_h = stored_s / 3600, ran * outage_s / 3600
+    meter, charge = 11990 + int(written * hours), 4900 + 60 * written * hours * sun
+    assert known.complaint(later(outage_s, meter + int(ran_h), charge + 60 * ran_h * sun), RULES) is None
 
 
 @given(st.floats(0, 1e7), st.floats(0, 1), st.floats(0, 1))
