@@ -26,7 +26,7 @@ from gateway.core.settings import LineSettings
 from gateway.core.site import Device
 from gateway.errors import PortError
 from gateway.lines.ports import close_port, open_port
-from gateway.lines.shell import STABLE_S, LineShell
+from gateway.lines.shell import LONGEST_ALARM_S, STABLE_S, LineShell
 from gateway.lines.threads import in_thread
 from gateway.lines.transports import Transport, transport_for
 
@@ -173,7 +173,7 @@ class SerialLine(LineShell):
         if due:  # nothing is to be done while a reply is still coming in, unless the wait for it is over
             deadline = max(deadline, min(self._reply_by, now + due * self._char_s))
         self._deadline = deadline
-        delay_s = deadline - now
+        delay_s = min(deadline - now, LONGEST_ALARM_S)
         if due:  # and a time-out need not be precise
             self._timer = loop.call_later(max(0.0, delay_s), self._on_timer)
         elif delay_s > PRECISE_S:

@@ -23,6 +23,8 @@ log = logging.getLogger(__name__)
 
 STABLE_S = 5.0
 """A line that stayed up so long works."""
+LONGEST_ALARM_S = 5.0
+"""A timer does not run while the machine sleeps: after that long a line looks at the clock again."""
 SAID = 16
 """Reasons that are remembered."""
 

@@ -40,7 +40,7 @@ from gateway.core.site import Device
 from gateway.core.upstream import UpstreamEngine
 from gateway.errors import PortError
 from gateway.lines.links import Address, Link, Links
-from gateway.lines.shell import STABLE_S, LineShell
+from gateway.lines.shell import LONGEST_ALARM_S, STABLE_S, LineShell
 from gateway.lines.threads import in_thread
 
 log = logging.getLogger(__name__)
@@ -412,7 +412,7 @@ class UpstreamLine(LineShell):
                 return  # it looks again when it goes off
             self._timer.cancel()
         self._deadline = deadline
-        self._timer = self._loop.call_later(max(0.0, deadline - now), self._on_timer)
+        self._timer = self._loop.call_later(min(LONGEST_ALARM_S, max(0.0, deadline - now)), self._on_timer)
 
     def _on_timer(self) -> None:
         self._timer = None

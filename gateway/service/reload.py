@@ -14,6 +14,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -62,7 +63,7 @@ class Reloader:
             await self._asked.wait()
             self._asked.clear()
             began = self._clock.monotonic()
-            self._systemd.reloading(began)
+            self._systemd.reloading(time.monotonic())
             try:
                 await self._reload(began)
             finally:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import TypeVar
@@ -74,3 +75,14 @@ async def lag_meter() -> AsyncIterator[LoopLag]:
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
+
+
+class SleepingClock(SystemClock):
+    """Of a machine that slept for `slept_s`, in which no timer ran."""
+
+    slept_s = 0.0
+    looks = 0  # how often somebody asked it
+
+    def monotonic(self) -> float:
+        self.looks += 1
+        return time.monotonic() + self.slept_s

@@ -14,13 +14,16 @@ from pathlib import Path
 import pytest
 
 from gateway.clock import SystemClock
+from gateway.core.settings import LineSettings, PollSettings
 from gateway.core.site import Device, LineState, Outcome
 from gateway.core.snapshot import DeviceState
+from gateway.devices.plan import poll_plan
 from gateway.devices.schema import load_map
 from gateway.errors import LineDown, ShuttingDown
+from gateway.lines.serial import SerialLine
 from gateway.modbus.crc import append_crc, crc_ok
 from gateway.modbus.pdu import Function, ReadRequest
-from tests.lines.rig import ask, make_line, running, until
+from tests.lines.rig import SleepingClock, ask, make_line, running, until
 from tests.machine import Stopwatch
 
 
@@ -250,3 +253,19 @@ async def test_only_a_line_that_could_work_and_does_not_is_overdue(controller: C
         controller.unplug()
         await until(lambda: line.status(0.0).state is LineState.DOWN)
         assert line.overdue_s(later) == 0.0
+
+
+async def test_after_the_machine_slept_values_are_read_anew_at_once(
+    controller: Controller, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Although the next poll is an hour of timers away."""
+    monkeypatch.setattr("gateway.lines.serial.LONGEST_ALARM_S", 0.05)
+    clock = SleepingClock()
+    seldom = PollSettings(live_s=3600.0, settings_s=3600.0)
+    settings = LineSettings(name="shelter-a", index=1, port=str(controller.link), reply_timeout_s=0.1, poll=seldom)
+    async with running(SerialLine(settings, [device], clock)):
+        await until(lambda: len(device.snapshot.blocks) == len(poll_plan(device.map)))
+        clock.slept_s = 8 * 3600.0
+        woke_at = clock.monotonic()
+        await until(lambda: all(at >= woke_at for at in device.snapshot.read_at.values()))
+        assert device.snapshot.state is DeviceState.ONLINE

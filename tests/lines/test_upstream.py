@@ -14,6 +14,7 @@ from gateway.clock import SystemClock
 from gateway.core.settings import LineSettings, PollSettings, UpstreamSettings
 from gateway.core.site import Device, LineState
 from gateway.core.snapshot import DeviceState
+from gateway.devices.plan import poll_plan
 from gateway.devices.schema import load_map
 from gateway.errors import LineDown
 from gateway.lines.upstream import UpstreamLine
@@ -21,7 +22,7 @@ from gateway.simulator.oracle import OracleController
 from gateway.simulator.tcp import TcpServer
 from gateway.simulator.upstream import Habits, SimulatedServer
 from tests.faults.rig import oracle_map
-from tests.lines.rig import ask, lag_meter, running, until
+from tests.lines.rig import SleepingClock, ask, lag_meter, running, until
 from tests.machine import Stopwatch
 
 FAST = PollSettings(live_s=0.2, settings_s=60.0)
@@ -229,3 +230,21 @@ async def test_the_prostar_map_is_served_by_a_real_server() -> None:
     ):
         await until(lambda: unit.snapshot.state is DeviceState.ONLINE)
         assert 11 < unit.snapshot.shown()["battery_voltage"] < 15
+
+
+async def test_after_the_machine_slept_an_upstream_is_read_anew_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Although the next poll is an hour of timers away."""
+    monkeypatch.setattr("gateway.lines.upstream.LONGEST_ALARM_S", 0.05)
+    clock, units = SleepingClock(), devices(2)
+    seldom = PollSettings(live_s=3600.0, settings_s=3600.0)
+    async with TcpServer(SimulatedServer(controllers(2))) as server:
+        where = UpstreamSettings("127.0.0.1", server.port)
+        settings = LineSettings("site-a", 1, server.url, reply_timeout_s=0.3, poll=seldom, upstream=where)
+        async with running(UpstreamLine(settings, units, clock)):
+            await until(lambda: all(len(unit.snapshot.blocks) == len(poll_plan(unit.map)) for unit in units))
+            looks = clock.looks
+            await until(lambda: clock.looks > looks + 20)  # although there is nothing to do
+            clock.slept_s = 8 * 3600.0
+            woke_at = clock.monotonic()
+            await until(lambda: all(at >= woke_at for unit in units for at in unit.snapshot.read_at.values()))
+            assert all_online(units)
