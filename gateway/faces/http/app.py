@@ -30,7 +30,7 @@ from gateway.faces.http.exposition import Exposition, compressed
 from gateway.faces.http.listener import HttpListener
 from gateway.faces.http.own import Counts, HttpStats
 from gateway.faces.http.page import index_page
-from gateway.faces.http.request import NO_STORE, Handler, Reply, Request
+from gateway.faces.http.request import JSON, NO_STORE, Handler, Reply, Request
 from gateway.faces.http.settings import HttpSettings
 from gateway.faces.http.text import accepts_gzip, negotiate
 
@@ -177,7 +177,7 @@ class HttpFace:
     async def _who_asks(self, _request: Request) -> Reply:
         return Reply.json(client_list.clients_document(self._clients, self._clock.monotonic()))
 
-    async def _what_is_wrong(self, request: Request) -> Reply:
+    async def _what_is_wrong(self, request: Request) -> Reply | None:
         try:
             everything = condition_list.wants_all(request.query)
         except ValueError as error:
@@ -186,7 +186,18 @@ class HttpFace:
             return Reply.json({"error": "nobody watches conditions"}, 404)
         now = self._clock.monotonic()
         self._conditions.look(now)
-        return Reply.json(condition_list.conditions_document(self._conditions, now, everything=everything))
+        request.by.begin((*NO_STORE, ("Content-Type", JSON)))
+        if request.head_only:
+            return None
+        try:
+            async with asyncio.timeout(self._settings.send_timeout_s):
+                for piece in condition_list.conditions_pieces(self._conditions, now, everything=everything):
+                    await request.by.write(piece)
+                    await asyncio.sleep(0)
+                await request.by.end()
+        except TimeoutError:
+            request.by.abort()
+        return None
 
     def _count_refused(self) -> None:
         self.stats.refused += 1

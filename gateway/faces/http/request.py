@@ -13,6 +13,7 @@ from typing import Protocol
 
 from gateway.faces.http.wire import Fields, Head
 
+JSON = "application/json; charset=utf-8"
 NO_STORE = (("Cache-Control", "no-store"),)
 
 
@@ -28,7 +29,7 @@ class Reply:
     @classmethod
     def json(cls, document: object, status: int = 200, fields: tuple[tuple[str, str], ...] = NO_STORE) -> Reply:
         """A document as JSON."""
-        return cls(status, json.dumps(document).encode(), "application/json; charset=utf-8", fields)
+        return cls(status, json.dumps(document).encode(), JSON, fields)
 
 
 class Exchange(Protocol):
