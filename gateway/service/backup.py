@@ -143,11 +143,20 @@ def _copy_database(path: Path, copy: Path) -> None:
         try:
             source.backup(target)
             target.execute("PRAGMA journal_mode = DELETE")  # one file, nothing beside it
+            damage = _damage(target)  # pages are copied as they are, and nothing damaged would be restored
         except sqlite3.DatabaseError as error:
             if error.sqlite_errorcode & 0xFF not in {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}:
                 raise
-            raise BackupError(f"{path}: {error}; start the gateway, which sets it aside, and try again") from error
+            damage = str(error)
+    if damage:
+        raise BackupError(f"{path}: {damage}; restart the gateway, which sets it aside, and try again")
     copy.chmod(0o600)
+
+
+def _damage(connection: sqlite3.Connection) -> str:
+    """What is wrong with a database, in one line; "" when it is whole."""
+    (found,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+    return "" if found == "ok" else " ".join(str(found).split())
 
 
 def _unpack(archive: Path, folder: Path) -> Manifest:
@@ -179,9 +188,9 @@ def _check_database(path: Path, archive: Path) -> None:
         if ASIDE in path.name or file.read(len(_DATABASE)) != _DATABASE:
             return
     with closing(sqlite3.connect(path)) as connection:
-        (found,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-    if found != "ok":
-        raise BackupError(f"{archive}: {path.name} is damaged: {found}")
+        damage = _damage(connection)
+    if damage:
+        raise BackupError(f"{archive}: {path.name} is damaged: {damage}")
 
 
 def _go_on_above(restored: Path, present: Path, made_at: float, now: float) -> None:

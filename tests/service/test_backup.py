@@ -341,8 +341,16 @@ def test_what_was_set_aside_as_damaged_is_kept_as_it_is(state: Path, tmp_path: P
     assert (tmp_path / "new" / f"{aside.name}-wal").read_bytes() == b"what was not yet in it"
 
 
-def test_a_history_that_is_damaged_now_is_named_with_what_to_do(state: Path, tmp_path: Path) -> None:
-    damage(state / FILE_NAME)
+@pytest.mark.parametrize("page", [None, 3], ids=["all of it", "a page that copying does not look into"])
+def test_a_history_that_is_damaged_now_is_named_with_what_to_do(state: Path, tmp_path: Path, page: int | None) -> None:
+    if page is None:
+        damage(state / FILE_NAME)
+    else:
+        whole = (state / FILE_NAME).read_bytes()
+        size = int.from_bytes(whole[16:18])
+        (state / FILE_NAME).write_bytes(whole[: page * size] + b"\xff" * size + whole[(page + 1) * size :])
+    archive = tmp_path / "backup.tar"
+    archive.write_bytes(b"that of yesterday")
     with pytest.raises(BackupError, match=rf"{state / FILE_NAME}: .*start the gateway, which sets it aside"):
-        back_up(state, "ridge-07", tmp_path / "backup.tar", MADE)
-    assert not (tmp_path / "backup.tar").exists()
+        back_up(state, "ridge-07", archive, MADE)
+    assert archive.read_bytes() == b"that of yesterday"
