@@ -3,6 +3,7 @@
 Rule 1: the first SIGTERM or SIGINT stops in order (service/supervisor.py), the second ends the process at once.
         Both leave exit status 0, also while it starts. When all is over signals are ignored until the interpreter has
         ended; a loop that handles them gives them back to the system when it is closed, which would end us by them.
+        Threads that still wait then for a disk, or a file system that is gone, are waited for `LEAVE_S`, no longer.
 Rule 2: when a part fails again and again, the gateway stops in the same order and leaves exit status 70, upon which
         systemd starts it anew.
 Rule 3: SIGHUP has the configuration read again, and every file that it names (service/reload.py).
@@ -14,6 +15,7 @@ import asyncio
 import logging
 import os
 import signal
+import threading
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -35,6 +37,8 @@ if TYPE_CHECKING:  # what it is at run time, plain.py says
 
 EX_SOFTWARE = 70
 """sysexits.h: an internal mistake was found."""
+
+LEAVE_S = 3.0
 
 _log = logging.getLogger(__name__)
 
@@ -76,9 +80,22 @@ async def _serve(path: Path, config: Config, log: Log) -> int:
         told.cancel()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    beyond_help = gateway.supervisor.beyond_help
-    _log.info("event=stopped status=%d", EX_SOFTWARE if beyond_help else 0)
-    return EX_SOFTWARE if beyond_help else 0
+    status = EX_SOFTWARE if gateway.supervisor.beyond_help else 0
+    _log.info("event=stopped status=%d", status)
+    _leave_soon(status)
+    return status
+
+
+def _leave_soon(status: int) -> None:
+    """End the process although a thread does not end, after a while; a daemon's timer is none that is waited for."""
+
+    def leave() -> None:
+        logging.shutdown()
+        os._exit(status)
+
+    timer = threading.Timer(LEAVE_S, leave)
+    timer.daemon = True
+    timer.start()
 
 
 async def _announce(gateway: Gateway, systemd: Systemd) -> None:

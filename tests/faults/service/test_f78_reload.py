@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from gateway.devices.schema import load_map
-from tests.e2e.programs import environment
+from tests.e2e.programs import alive, environment
 from tests.faces.modbus.tls.conftest import pki
 from tests.faces.modbus.tls.site import Pki
 from tests.faults.service.rig import NotifySocket, Service, client, descriptors
@@ -353,6 +353,44 @@ async def test_what_only_a_restart_can_change_is_said_and_kept(service: Service)
     assert any("event=reload_needs_restart key=state_dir" in line for line in program.seen)
     assert not (service.folder / "elsewhere").exists()
     assert await service.end() == 0
+
+
+@pytest.mark.parametrize("hangs", ["the process that reads", "the gateway itself"])
+async def test_a_stop_does_not_wait_for_a_file_that_does_not_come(service: Service, tmp_path: Path, hangs: str) -> None:
+    """As on a network file system whose server is gone: who opens the file waits."""
+    table, _ = user("noc", tmp_path, "correct-horse-1")
+    configure(service, A1, rest=FAST + table)
+    program = service.start()
+    await service.online()
+    secret, pid = tmp_path / "noc.secret", program.process.pid
+    secret.unlink()
+    os.mkfifo(secret)
+    program.process.send_signal(signal.SIGHUP)
+    async with asyncio.timeout(30):
+        while not opens_a_pipe(pid):
+            if any(map(opens_a_pipe, children_of_all(pid))):
+                if hangs == "the process that reads":
+                    break
+                await asyncio.to_thread(secret.write_text, "correct-horse-1")
+            await asyncio.sleep(0.01)
+    began = time.monotonic()
+    program.process.terminate()
+    assert await service.ended() == 0
+    assert time.monotonic() - began < 10.0  # F72
+    assert program.log().endswith("event=stopped status=0")
+
+
+def children_of_all(pid: int) -> list[int]:
+    """What any thread of the process has started, and is not over."""
+    found = []
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        found += [int(child) for child in (task / "children").read_text().split()]
+    return alive(found)
+
+
+def opens_a_pipe(pid: int) -> bool:
+    """Whether a thread of the process waits for somebody who writes into what it wants to read."""
+    return any((task / "wchan").read_text() == "wait_for_partner" for task in Path(f"/proc/{pid}/task").iterdir())
 
 
 async def test_stopping_in_the_middle_of_a_reload(service: Service) -> None:
