@@ -10,6 +10,8 @@ import base64
 import contextlib
 import http.client
 import pprint
+import resource
+import shutil
 import ssl
 import subprocess
 from collections.abc import Callable, Iterator
@@ -132,7 +134,11 @@ def running(
     tmp_path: Path, free_tcp_port: Callable[[], int], free_udp_port: Callable[[], int]
 ) -> Iterator[tuple[Site, Program]]:
     site = Site(tmp_path, (free_tcp_port(), free_udp_port(), free_tcp_port()))
-    program = Program([*GATEWAY, "run", "--log-level", "debug", "-c", str(site.config)])
+    prlimit = shutil.which("prlimit", path="/usr/bin:/bin")
+    assert prlimit is not None
+    core = resource.getrlimit(resource.RLIMIT_CORE)[1]  # as much as may be, so that none is the gateway's own doing
+    most = f"--core={'unlimited' if core == resource.RLIM_INFINITY else core}"
+    program = Program([prlimit, most, *GATEWAY, "run", "--log-level", "debug", "-c", str(site.config)])
     try:
         yield site, program
     finally:

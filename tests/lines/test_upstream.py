@@ -24,6 +24,7 @@ from gateway.simulator.upstream import Habits, SimulatedServer
 from tests.faults.rig import oracle_map
 from tests.lines.rig import SleepingClock, ask, lag_meter, running, until
 from tests.machine import Stopwatch
+from tests.optional import optional
 
 FAST = PollSettings(live_s=0.2, settings_s=60.0)
 
@@ -72,7 +73,7 @@ async def test_values_come_over_ipv4_ipv6_and_by_name(host: str) -> None:
 
 
 def test_it_runs_on_uvloop() -> None:
-    uvloop = pytest.importorskip("uvloop")
+    uvloop = optional("uvloop")
     for habits in (Habits(), Habits(closes=True)):
         uvloop.run(online_once(habits))
 

@@ -31,6 +31,7 @@ from gateway.service.settings import (
 )
 from gateway.service.snmp import snmp_settings
 from tests.faces.http.test_access import certificate, written
+from tests.optional import optional
 
 TEXT = """
 site = "ridge-07"
@@ -238,7 +239,7 @@ async def lifetime(config: Config) -> None:
 @pytest.mark.parametrize("choice", [Loop.ASYNCIO, Loop.UVLOOP, Loop.AUTO])
 def test_it_starts_and_stops_on_either_loop(choice: Loop, tmp_path: Path) -> None:
     if choice is Loop.UVLOOP:
-        pytest.importorskip("uvloop")
+        optional("uvloop")
     text = TEXT.replace(', "[::1]:0"', "").replace("socket://192.0.2.1:4001", "/nonexistent/b")
     config = parse_config(f'state_dir = "{tmp_path}"\n{text}')
     with asyncio.Runner(loop_factory=loop_factory(choice)) as runner:

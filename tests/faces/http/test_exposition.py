@@ -28,6 +28,7 @@ from gateway.faces.http.packing import packer
 from gateway.faces.http.text import OPENMETRICS, TEXT, Format
 from tests.faces.http.reference import registry
 from tests.faces.http.scrapes import Seen, joined, parse, scrape, seen
+from tests.optional import optional
 
 from .conftest import VALUES, ManualClock, UnreadableLine, make_device, online
 
@@ -240,7 +241,7 @@ async def test_a_poll_during_a_scrape_changes_nothing_of_it(clock: ManualClock) 
 @pytest.mark.parametrize("library", ["ISA-L", "zlib"])
 async def test_gzip_in_pieces_is_one_stream(clock: ManualClock, library: str, monkeypatch: pytest.MonkeyPatch) -> None:
     if library == "ISA-L":
-        pytest.importorskip("isal")
+        optional("isal")
     else:
         monkeypatch.setitem(sys.modules, "isal.isal_zlib", None)
     assert isinstance(packer()[0], type(zlib.compressobj())) is (library == "zlib")

@@ -14,6 +14,7 @@ from aiohttp import ClientSession, ClientTimeout
 from gateway.faces.http.connection import Connection
 from gateway.faces.http.handshakes import Handshakes
 from gateway.service.loops import Loop, loop_factory
+from tests.optional import optional
 
 from .conftest import Gateway
 from .test_access import certificate
@@ -27,7 +28,7 @@ def test_strangers_who_never_shake_hands_are_few_and_keep_nobody_out(
     make_gateway: MakeGateway, tmp_path: Path, choice: Loop
 ) -> None:  # F67
     if choice is Loop.UVLOOP:
-        pytest.importorskip("uvloop")
+        optional("uvloop")
     with asyncio.Runner(loop_factory=loop_factory(choice)) as runner:
         runner.run(_besieged(make_gateway, tmp_path))
 

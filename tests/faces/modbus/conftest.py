@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import importlib.util
+import os
 import socket
 import struct
 from collections import deque
@@ -225,9 +226,9 @@ class World:
 
 
 def pytest_asyncio_loop_factories() -> dict[str, Callable[[], asyncio.AbstractEventLoop]]:
-    """Every test of this room runs on both loops; the fast one is optional."""
+    """Every test of this room runs on both loops; the fast one is optional, but where CI is set (tests/optional.py)."""
     factories: dict[str, Callable[[], asyncio.AbstractEventLoop]] = {"asyncio": asyncio.new_event_loop}
-    if importlib.util.find_spec("uvloop") is not None:
+    if os.environ.get("CI") or importlib.util.find_spec("uvloop") is not None:
         factories["uvloop"] = importlib.import_module("uvloop").new_event_loop
     return factories
 

@@ -79,8 +79,8 @@ def test_a_scrape_is_quick_and_few_are_kept(launch: Launch, tmp_path: Path, *, s
     site = launch(http_keys=keys, trusted=trusted)
     site.wait_online()
     usual = descriptors(site.get("/metrics")[1])
-    began = time.monotonic()
     with strangers(site.http, trusted) as opened:
+        all_there = time.monotonic()
         taken: list[float] = []
         while len(taken) < 5 or (min(taken) >= SCRAPE_S and len(taken) < 50):  # of a busy machine its best
             asked = time.monotonic()
@@ -92,5 +92,5 @@ def test_a_scrape_is_quick_and_few_are_kept(launch: Launch, tmp_path: Path, *, s
         assert min(taken) < SCRAPE_S
         wait_until(lambda: sum(map(is_open, opened)) <= kept, f"{kept} of {STRANGERS} connections at most")
         wait_until(lambda: not any(map(is_open, opened)), "the end of the last of them")
-        assert time.monotonic() - began < 10 * HEADER_S
+        assert time.monotonic() - all_there < 3 * HEADER_S, "its time, and a busy machine"
     assert site.get("/healthz")[0] == 200

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import signal
 import socket
+import struct
 from collections.abc import AsyncIterator, Callable, Sequence
 from pathlib import Path
 
@@ -166,6 +167,12 @@ class Client:
     def send(self, data: bytes) -> None:
         """Send bytes as they are."""
         self._writer.write(data)
+
+    def reset(self) -> None:
+        """Be gone at once: RST instead of FIN, after which replies would still be sent."""
+        sock = self._writer.get_extra_info("socket")
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self._writer.transport.abort()
 
     async def reply(self, timeout_s: float = 30.0) -> bytes:
         """The PDU of the next reply; b"" when the connection is over."""

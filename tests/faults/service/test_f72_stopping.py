@@ -79,6 +79,8 @@ async def test_a_write_on_the_wire_is_waited_for_and_never_called_busy(service: 
             program.process.terminate()
             assert await asker.reply() == b"\x86\x0b"
             assert await asker.reply() == b""
+        else:
+            asker.reset()
     if not stays:
         program.process.terminate()
     assert await service.ended() == 0

@@ -9,6 +9,7 @@ import time
 import pytest
 
 from tests.faults.service.rig import Service, client, read
+from tests.optional import optional
 
 
 @pytest.mark.parametrize("second", [signal.SIGTERM, signal.SIGINT])
@@ -34,7 +35,7 @@ async def test_a_second_signal_does_not_wait(service: Service, second: signal.Si
 async def test_a_signal_when_all_is_over_changes_nothing(service: Service, number: signal.Signals, loop: str) -> None:
     """The interpreter takes a while to end: what comes then is not what it ends by."""
     if loop == "uvloop":
-        pytest.importorskip("uvloop")
+        optional("uvloop")
     service.configure()
     program = service.start("--loop", loop)
     await service.log("event=line_up")

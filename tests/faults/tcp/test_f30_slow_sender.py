@@ -23,6 +23,25 @@ async def test_half_a_request_must_be_completed_in_time(running: Running) -> Non
     assert await other.query(12, READ_1)
 
 
+async def test_half_a_request_that_became_whole_in_time_is_not_held_against_it(running: Running) -> None:
+    world = running.world
+    world.poll(12)
+    client, other = await running.connect(), await running.connect()
+    for _ in range(3):
+        client.send(GOOD[:-1])
+        await other.query(12, READ_1)
+        world.clock.now += 4.0
+        world.poll(12)
+        running.server.sweep()
+        client.send(GOOD[-1:])
+        assert await client.adus(1) == [mbap.Adu(1, 12, GOOD_REPLY[7:])]
+        world.clock.now += 4.0
+        world.poll(12)
+        running.server.sweep()
+    assert world.stats.open_connections == 2
+    assert not world.stats.closed
+
+
 async def test_a_request_that_the_server_itself_left_half_read_is_not_late(running: Running) -> None:
     world = running.world
     line = world.line(12)

@@ -12,7 +12,7 @@ from gateway.core.snapshot import Block
 from gateway.devices.model import Space
 from gateway.faces.modbus.connection import MAX_UNSENT, MAX_WAITING, Connection
 from gateway.modbus import mbap
-from tests.faces.modbus.conftest import Client, Running, World, read, registers
+from tests.faces.modbus.conftest import Client, Running, Serve, World, read, registers
 
 LONGEST = bytes.fromhex("03 0000 007d")
 """A read whose reply is as long as one can be: 125 registers."""
@@ -61,6 +61,19 @@ async def test_it_is_paused_then_cut_off(running: Running, at_once: int) -> None
     running.server.sweep()
     await running.until(lambda: world.stats.open_connections == 0)
     assert world.stats.closed == {"not_reading": 1}
+
+
+async def test_a_listener_that_stops_does_not_wait_for_it_for_ever(serve: Serve, world: World) -> None:
+    running = await serve(stop_grace_s=0.05)
+    remember_the_longest(world)
+    client, connection = await deaf(running)
+    async with asyncio.timeout(30):
+        while connection._unsent_since is None:
+            client.send(mbap.encode(1, 12, LONGEST) * 100)
+            await asyncio.sleep(0)
+        await running.server.listeners[0].stop()
+    await running.until(lambda: world.stats.open_connections == 0)
+    assert world.stats.closed == {"stopped": 1}
 
 
 async def test_who_takes_its_replies_late_gets_them_all(running: Running) -> None:
