@@ -355,9 +355,11 @@ async def test_what_only_a_restart_can_change_is_said_and_kept(service: Service)
     assert await service.end() == 0
 
 
-@pytest.mark.parametrize("hangs", ["the process that reads", "the gateway itself"])
-async def test_a_stop_does_not_wait_for_a_file_that_does_not_come(service: Service, tmp_path: Path, hangs: str) -> None:
-    """As on a network file system whose server is gone: who opens the file waits."""
+async def test_a_stop_does_not_wait_for_a_file_that_does_not_come(service: Service, tmp_path: Path) -> None:
+    """As on a network file system whose server is gone: who opens the file waits, here a thread of the gateway itself.
+
+    The process that reads the configuration: tests/faults/service/test_f72_stopping.py.
+    """
     table, _ = user("noc", tmp_path, "correct-horse-1")
     configure(service, A1, rest=FAST + table)
     program = service.start()
@@ -369,8 +371,6 @@ async def test_a_stop_does_not_wait_for_a_file_that_does_not_come(service: Servi
     async with asyncio.timeout(30):
         while not opens_a_pipe(pid):
             if any(map(opens_a_pipe, children_of_all(pid))):
-                if hangs == "the process that reads":
-                    break
                 await asyncio.to_thread(secret.write_text, "correct-horse-1")
             await asyncio.sleep(0.01)
     began = time.monotonic()
