@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from gateway.cli import backup, check_config, clients, demo, generate, log, record, run, scan, simulate, writes
+from gateway.cli import backup, check_config, clients, demo, generate, health, log, record, run, scan, simulate, writes
 
 app = typer.Typer(
     help="Modbus TCP, SNMP and Prometheus for Morningstar solar charge controllers on serial lines.",
@@ -21,6 +21,7 @@ app.command("demo")(demo.command)
 app.command("simulate")(simulate.command)
 app.command("scan")(scan.command)
 app.command("clients")(clients.command)
+app.command("health")(health.command)
 app.command("writes")(writes.command)
 app.command("generate")(generate.command)
 app.command("log")(log.command)

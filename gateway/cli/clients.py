@@ -28,7 +28,6 @@ from gateway.service.parsing import parse_listen
 from gateway.service.schema import HttpTable
 
 TIMEOUT_S = 5.0
-_ANY = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104 - where it listens on all, it is asked on loopback
 
 
 class _Unreachable(Exception):
@@ -58,7 +57,7 @@ def command(
 def _ask(http: HttpTable) -> Mapping[str, Any]:
     address = parse_listen(http.listen[0])
     where = f"http{'s' if http.tls_certificate else ''}://{address}{PATH}"
-    host = _ANY.get(address.host, address.host)
+    host = address.reached_at
     try:
         if http.tls_certificate:
             context = ssl.create_default_context(cafile=http.tls_certificate)

@@ -27,6 +27,12 @@ def main() -> None:
         arguments = plain_arguments(sys.argv[2:])
         if arguments is not None:
             raise SystemExit(run(arguments))
+    if sys.argv[1:2] == ["health"]:
+        from gateway.cli import alive  # noqa: PLC0415 - as above
+
+        path = alive.plain_arguments(sys.argv[2:])
+        if path is not None:
+            raise SystemExit(alive.health(path))
     from gateway.cli.app import app  # noqa: PLC0415 - as above
 
     app(prog_name="prostar-gateway")

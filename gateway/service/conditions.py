@@ -29,18 +29,24 @@ Told = Callable[[Sequence[Watch], float], None]
 """Is given the conditions that changed, and when."""
 
 
-def usable(directory: Path) -> bool:
-    """Whether files can be written in the directory, as far as can be told without writing one; blocks on the disk.
+def why_unusable(directory: Path) -> str:
+    """Why no files can be written in the directory, as far as can be told without writing one; blocks on the disk.
 
-    One that is missing is made by whoever needs it first, so its nearest parent is looked at.
+    Empty when they can. One that is missing is made by whoever needs it first, so its nearest parent is looked at.
     """
     try:
         while not directory.exists():
             directory = directory.parent
         filesystem = os.statvfs(directory)
-        return os.access(directory, os.W_OK | os.X_OK) and filesystem.f_bavail * filesystem.f_frsize >= FREE_OCTETS
-    except OSError:
-        return False
+        if filesystem.f_bavail * filesystem.f_frsize < FREE_OCTETS:
+            return f"{directory}: less than {FREE_OCTETS >> 20} MiB is free"
+        if filesystem.f_flag & os.ST_RDONLY:
+            return f"{directory}: is on a read-only file system"
+        if not os.access(directory, os.W_OK | os.X_OK):
+            return f"{directory}: belongs to uid {directory.stat().st_uid}, and uid {os.geteuid()} may not write there"
+    except OSError as error:
+        return f"{directory}: {error.strerror or error}"
+    return ""
 
 
 class ConditionKeeper:
@@ -102,7 +108,15 @@ class ConditionKeeper:
             self.told(changed, now)
 
     async def _probe(self) -> None:
+        told, since = "", 0.0
         while True:
-            fine = await asyncio.to_thread(usable, self._state_dir)
-            self.conditions.gateway.tell(STATE_DIR, raised=not fine, now=self._clock.monotonic())
+            reason = await asyncio.to_thread(why_unusable, self._state_dir)
+            now = self._clock.monotonic()
+            self.conditions.gateway.tell(STATE_DIR, raised=bool(reason), now=now)
+            if reason and not told:
+                _log.error('event=state_dir_unusable reason="%s"', reason.replace('"', "'"))
+                since = now
+            elif told and not reason:
+                _log.info("event=state_dir_usable lasted_s=%.1f", now - since)
+            told = reason
             await self._sleep(PROBE_S)

@@ -9,6 +9,11 @@ from dataclasses import dataclass
 MORNINGSTAR_ROOT = (1, 3, 6, 1, 4, 1, 33333)
 DOCUMENTATION_ROOT = (1, 3, 6, 1, 4, 1, 32473)
 
+HTTP_LISTEN = "127.0.0.1:9850"
+"""Where the HTTP face is unless the configuration says otherwise."""
+
+_ANY = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104 - where it listens on all, it is asked on loopback
+
 
 @dataclass(frozen=True, slots=True)
 class Address:
@@ -24,6 +29,11 @@ class Address:
     def loopback(self) -> bool:
         """Whether only this machine can reach it."""
         return ipaddress.ip_address(self.host).is_loopback
+
+    @property
+    def reached_at(self) -> str:
+        """The host by which this machine reaches it."""
+        return _ANY.get(self.host, self.host)
 
 
 def parse_listen(text: str) -> Address:

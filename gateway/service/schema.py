@@ -35,6 +35,7 @@ from gateway.service.keys import (
     Seconds,
     Table,
 )
+from gateway.service.parsing import HTTP_LISTEN
 from gateway.service.schema_snmp import CommunityTable, Emc1Table, NotifyTable, SnmpTable, UserTable, ViewTable
 from gateway.service.schema_tls import ROLES, Roles, TlsTable
 
@@ -381,7 +382,7 @@ class ModbusTable(Table):
 class HttpTable(Table):
     """`[http]`: /metrics, /sd, /healthz and /readyz."""
 
-    listen: Annotated[Listens, Key(LISTENS, "Where Prometheus scrapes and health checks ask.")] = ("127.0.0.1:9850",)
+    listen: Annotated[Listens, Key(LISTENS, "Where Prometheus scrapes and health checks ask.")] = (HTTP_LISTEN,)
     basic_auth_file: Annotated[
         AbsolutePath,
         Key(A_FILE, "Names and passwords of who may ask, one name:password a line; /healthz stays open."),

@@ -42,7 +42,8 @@ def test_compose_has_the_shape_and_the_files(delivered: Path) -> None:
     for service in services:
         known = {key for indent, key, _ in keys(service) if indent == 4 and key}
         assert {"image", "network_mode", "volumes"} <= known
-        assert re.search(r"image: [\w./-]+:v?\d+\.\d+\.\d+$", service, re.MULTILINE), "a fixed version"
+        image = r"image: docker\.io/[\w./-]+:v?\d+\.\d+\.\d+$"
+        assert re.search(image, service, re.MULTILINE), "a fixed version, by a name that podman takes too"
     assert len(mounts(text)) == 4
     for host, _ in mounts(text):
         assert (delivered / host).exists(), host

@@ -37,6 +37,7 @@ ELSEWHERE = {
     r"(deploy/install.sh|cp site.toml /etc)": "tests/deploy/test_install.py",
     r"(apt-get install|systemctl|journalctl|editor|ls -l /dev/serial)": "tests/deploy/test_install.py",
     r"python (-m tests.fuzz.corpus|tests/fuzz/fuzz_)": "tests/fuzz/test_fuzz.py",
+    r"podman ": "tests/deploy/test_image.py",
     r"prostar-gateway scan ": "tests/cli/test_scan.py",
     r"prostar-gateway simulate --tcp": "tests/simulator/test_simulate.py",
 }

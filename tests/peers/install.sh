@@ -41,6 +41,10 @@ peers=(
   "systemd systemd-analyze"
   "udev udevadm"
   "umockdev umockdev-run"
+  "podman podman"
+  "crun crun"
+  "catatonit catatonit"
+  "debootstrap debootstrap"
 )
 policy=/usr/sbin/policy-rc.d
 export PATH="$PATH:/usr/local/sbin:/usr/sbin:/sbin"
@@ -142,6 +146,7 @@ if [[ -d /run/systemd/system ]]; then
     case $package in
       prometheus | prometheus-snmp-exporter | snmpd | ser2net) "${root[@]}" systemctl disable --now --quiet "$package.service" || true ;;
       snmptrapd) "${root[@]}" systemctl disable --now --quiet snmptrapd.service snmptrapd.socket || true ;;
+      podman) "${root[@]}" systemctl disable --now --quiet podman.socket podman.service podman-auto-update.timer podman-restart.service || true ;;
     esac
   done
 fi

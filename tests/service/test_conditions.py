@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from gateway.core.conditions import DOWN_S, Watch
 from gateway.core.site import Site
 from gateway.core.stats import HistoryStats
 from gateway.service import conditions as module
-from gateway.service.conditions import ConditionKeeper, usable
+from gateway.service.conditions import ConditionKeeper, why_unusable
 
 
 @dataclass
@@ -86,34 +87,43 @@ def test_a_listener_that_is_closed_for_a_moment_is_no_condition(tmp_path: Path) 
 
 
 async def test_it_looks_until_cancelled_and_probes_the_directory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    fine = False
-    monkeypatch.setattr(module, "usable", lambda _directory: fine)
+    caplog.set_level(logging.INFO)
+    reason = 'the "disk" is full'
+    monkeypatch.setattr(module, "why_unusable", lambda _directory: reason)
     plant = Plant(tmp_path)
     task = asyncio.create_task(plant.keeper.run())
     await plant.wait_for("state_dir_unusable RAISED")
-    fine = True
+    reason = ""
     await plant.wait_for("state_dir_unusable CLEAR")
     task.cancel()
     await asyncio.wait([task])
     assert task.cancelled()
+    said = [record.getMessage() for record in caplog.records if "event=state_dir" in record.getMessage()]
+    assert said[0] == """event=state_dir_unusable reason="the 'disk' is full\""""
+    assert [text.partition("=")[2].split("=")[0] for text in said[1:]] == ["state_dir_usable lasted_s"]
 
 
 def test_a_directory_that_can_be_made_is_usable(tmp_path: Path) -> None:
-    assert usable(tmp_path)
-    assert usable(tmp_path / "state" / "gateway")
+    assert why_unusable(tmp_path) == ""
+    assert why_unusable(tmp_path / "state" / "gateway") == ""
 
 
-def test_a_full_or_forbidden_directory_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(_path: Path) -> os.statvfs_result:
-        return os.statvfs_result((4096, 4096, 1000, 3, 3, 0, 0, 0, 0, 255))
+def on_a_disk(monkeypatch: pytest.MonkeyPatch, free: int, flags: int) -> None:
+    result = os.statvfs_result((4096, 4096, 1000, free, free, 0, 0, 0, flags, 255))
+    monkeypatch.setattr(os, "statvfs", lambda _path: result)
 
+
+def test_why_it_is_not_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patched:
-        patched.setattr(os, "statvfs", full)
-        assert not usable(tmp_path)
-    monkeypatch.setattr(os, "access", lambda *_: False)  # as on a read-only filesystem, for root too
-    assert not usable(tmp_path)
+        on_a_disk(patched, free=3, flags=0)
+        assert why_unusable(tmp_path) == f"{tmp_path}: less than 1 MiB is free"
+        on_a_disk(patched, free=1000, flags=os.ST_RDONLY)
+        assert why_unusable(tmp_path) == f"{tmp_path}: is on a read-only file system"
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    mine = os.geteuid()
+    assert why_unusable(tmp_path) == f"{tmp_path}: belongs to uid {mine}, and uid {mine} may not write there"
 
 
 def test_a_disk_that_gives_errors_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -121,4 +131,4 @@ def test_a_disk_that_gives_errors_is_not(tmp_path: Path, monkeypatch: pytest.Mon
         raise OSError(5, "Input/output error")
 
     monkeypatch.setattr(os, "statvfs", broken)
-    assert not usable(tmp_path)
+    assert why_unusable(tmp_path) == f"{tmp_path}: Input/output error"
