@@ -2,9 +2,9 @@
 
 Rule 1: a block whose hourmeter is zero or all ones (24 or 32 bits) was never written and is left out.
 Rule 2: the document says high word first, units in the field were seen with the low word first. The right order
-        is the one in which the hourmeters grow along the ring and none is ahead of the live hourmeter; while
-        both would do, the one whose days lie closer together, and then the document's. All 32-bit fields of a
-        log share one order.
+        is the one in which the hourmeters grow along the ring and none is ahead of the live hourmeter, but for what a
+        unit loses that loses its power (`LOST_HOURS`); while both would do, the one whose days lie closer together, and
+        then the document's. All 32-bit fields of a log share one order.
 Rule 3: going once around the ring, the hourmeter steps back exactly once, from the newest day to the oldest.
 Rule 4: values come in base units: minutes become seconds.
 """
@@ -22,6 +22,9 @@ from gateway.devices.model import LogLayout, Value, WordOrder
 
 HOURMETER = "hourmeter"
 """Name of the field that every log layout must have."""
+
+LOST_HOURS = 25
+"""A unit that lost its power counts on from the hours that EEPROM has, which were written up to a day before."""
 
 _NEVER_WRITTEN = frozenset({0, 0x00FF_FFFF, 0xFFFF_FFFF})
 
@@ -103,7 +106,7 @@ def detect_order(pairs: Sequence[Sequence[int]], live_hourmeter: int | None = No
 
 
 def _misfits(hours: Sequence[int], live_hourmeter: int | None) -> int:
-    ahead = 0 if live_hourmeter is None else sum(hour > live_hourmeter for hour in hours)
+    ahead = 0 if live_hourmeter is None else sum(hour > live_hourmeter + LOST_HOURS for hour in hours)
     around = [*hours, *hours[:1]]
     steps_back = sum(later < earlier for earlier, later in pairwise(around))
     return ahead + max(0, steps_back - 1)

@@ -9,12 +9,16 @@ Rule 3: the hourmeter stands still while the controller has no power. A day writ
         a controller that always had power, else they are older than stated.
 Rule 4: two looks that are further apart by hourmeter than by the clock mean that the gateway's clock was wrong at
         one of them: the difference is added to the bound.
-Rule 5: a clock that shows a year before this program existed was never set: no date is better than that one.
+Rule 5: a day ahead of the hourmeter was written before the controller lost its power, and some hours with it: not after
+        the look, and when is not known to a day.
+Rule 6: a clock that shows a year before this program existed was never set: no date is better than that one.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+
+from gateway.devices.log import LOST_HOURS
 
 HOUR_S = 3600.0
 CLOCK_S = 60.0
@@ -47,13 +51,13 @@ class Estimate:
 
 
 def estimate(hourmeter: int, now: Look, before: Look | None = None) -> Estimate | None:
-    """When the day with this hourmeter was written, by the look of now and the last one before it; None: rule 5."""
+    """When the day with this hourmeter was written, by the look of now and the last one before it; None: rule 6."""
     if not now.clock_set:
         return None
-    latest = now.wall - (now.hours - hourmeter) * HOUR_S
+    latest = now.wall - max(0, now.hours - hourmeter) * HOUR_S
     after_s = _error_s(now.hours - hourmeter)
     if before is None or not before.clock_set or hourmeter < before.hours:
-        return Estimate(latest, after_s)
+        return Estimate(latest, after_s + (LOST_HOURS * HOUR_S if hourmeter > now.hours + 1 else 0.0))
     earliest = before.wall + (hourmeter - before.hours) * HOUR_S
     if latest < earliest - after_s:
         return Estimate(latest, after_s + earliest - latest)

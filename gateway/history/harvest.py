@@ -22,10 +22,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-from gateway.devices.log import hourmeter_of, split_blocks
+from gateway.devices.log import LOST_HOURS, hourmeter_of, split_blocks
 from gateway.devices.model import DeviceMap, LogLayout, Space
 from gateway.history.identity import Position
-from gateway.history.ring import SLACK_HOURS
 from gateway.modbus.pdu import MAX_REGISTERS, ReadRequest, is_exception
 
 TRIES = 3
@@ -194,7 +193,7 @@ class Harvest:
             if hour is None or hour < self._hour:
                 self.outcome = Outcome.NEWER
                 return
-            if hour > self._live_hours + SLACK_HOURS:
+            if hour > self._live_hours + LOST_HOURS:
                 self.odd = True
                 self.outcome = Outcome.NEWER
                 return

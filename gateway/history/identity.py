@@ -4,7 +4,7 @@ A controller is one by its serial number, where it tells one (the register is un
 place (line and device name), and proved by its log: two controllers do not share blocks of sixteen words.
 
 Rule 1: a controller whose hourmeter, product or serial number is not what the history knows is another one. The
-        hourmeter never goes back.
+        hourmeter goes back no further than a controller loses with its power (`LOST_HOURS`).
 Rule 2: the same log is the same controller, wherever it is found: a renamed device or a controller that was moved
         to another line goes on with its history. A log is the same when `PROOF_DAYS` blocks are, or all that it has.
 Rule 3: without a common block it is the controller last seen in its place if nothing speaks against it: the ring has
@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
+from gateway.devices.log import LOST_HOURS
 from gateway.devices.model import WordOrder
 from gateway.history.dates import CLOCK_S, DRIFT, HOUR_S, Look
 from gateway.history.ring import Ring
@@ -77,7 +78,7 @@ def fits(known: Known, seen: Seen) -> bool:
         known.model == seen.model
         and not (known.serial and seen.serial and known.serial != seen.serial)
         and not (known.product and seen.product and known.product != seen.product)
-        and seen.look.hours >= known.look.hours
+        and seen.look.hours >= known.look.hours - LOST_HOURS
     )
 
 

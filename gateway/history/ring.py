@@ -4,7 +4,8 @@ Rule 1: blocks that were never written are skipped; the word order is found by d
 Rule 2: around the ring the hourmeter steps back once, from the newest day to the oldest. A block that does not fit
         is kept apart with a reason, so that one wrong hourmeter costs one block: of all ways to leave blocks out,
         the one that leaves out fewest.
-Rule 3: a block ahead of the live hourmeter is kept apart. `SLACK_HOURS` allow for a day that ended in between.
+Rule 3: a block ahead of the live hourmeter is kept apart. `LOST_HOURS` (devices/log.py) allow for a controller that
+        lost its power, and for a day that ended in between.
 Rule 4: of two written blocks with one hourmeter the first in ring order is the day, the other is kept apart.
 Rule 5: two equal blocks are one.
 """
@@ -17,10 +18,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
 
-from gateway.devices.log import decode_log
+from gateway.devices.log import LOST_HOURS, decode_log
 from gateway.devices.model import LogLayout, Value, WordOrder
-
-SLACK_HOURS = 1
 
 
 class Why(StrEnum):
@@ -66,12 +65,12 @@ def read_ring(
     """The days in these blocks by slot, all or some of a ring; ValueError when a block has another size."""
     log = decode_log(layout, blocks, live_hours, known_order)
     written = sorted((Day(d.slot, d.hourmeter, blocks[d.slot], d.values) for d in log.days), key=lambda day: day.slot)
-    apart = [_apart(day, Why.AHEAD) for day in written if day.hourmeter > live_hours + SLACK_HOURS]
-    days = _rising([day for day in written if day.hourmeter <= live_hours + SLACK_HOURS])
+    apart = [_apart(day, Why.AHEAD) for day in written if day.hourmeter > live_hours + LOST_HOURS]
+    days = _rising([day for day in written if day.hourmeter <= live_hours + LOST_HOURS])
     kept = {day.slot for day in days}
     by_hour = {day.hourmeter: day for day in days}
     for day in written:
-        if day.slot in kept or day.hourmeter > live_hours + SLACK_HOURS:
+        if day.slot in kept or day.hourmeter > live_hours + LOST_HOURS:
             continue
         twin = by_hour.get(day.hourmeter)
         if twin is None:

@@ -67,6 +67,23 @@ def test_looks_that_contradict_each_other_widen_the_bound() -> None:
     assert found.error_s == pytest.approx(alone.error_s + 50 * HOUR_S)
 
 
+@given(
+    hours=st.floats(1000, 2000), ran=st.floats(0, 24), kept=st.floats(0, 24), on=st.floats(0, 24), off=st.floats(0, 9)
+)
+def test_a_day_from_before_the_power_was_lost_is_within_the_bound(
+    hours: float, ran: float, kept: float, on: float, off: float
+) -> None:
+    """Written `ran` hours before that, while EEPROM had what was `kept` hours old; then `off`, then `on` again."""
+    now = Look(int(hours + ran - kept + on), WALL + (hours + ran + off + on) * HOUR_S)
+    assume(int(hours) > now.hours + 1)
+    for before in (None, look_at(hours - 30)):
+        found = estimate(int(hours), now, before)
+        assert found is not None
+        assert found.at <= now.wall + HOUR_S
+        if before is not None or ran + off + on <= 24:
+            assert abs(found.at - (WALL + hours * HOUR_S)) <= found.error_s
+
+
 def test_a_clock_that_was_never_set_makes_no_dates() -> None:
     unset = Look(1000, 86_400.0)
     assert not unset.clock_set

@@ -20,7 +20,8 @@ KNOWN = Known(1, "a", "prostar-mppt", "PS-MPPT-25M", "", PLACE, Look(HOURS[-1] +
     ("who", "same"),
     [
         (seen(HOURS[-1] + 1), True),
-        (seen(HOURS[-1]), False),  # the hourmeter never goes back
+        (seen(HOURS[-1] + 1 - 25), True),  # what is lost with the power
+        (seen(HOURS[-1] + 1 - 26), False),
         (seen(HOURS[-1] + 9, product="PS-MPPT-40"), False),
         (seen(HOURS[-1] + 9, product=""), True),
         (seen(HOURS[-1] + 9, serial="17340001"), True),

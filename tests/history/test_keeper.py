@@ -404,6 +404,37 @@ async def test_days_behind_a_wrong_hourmeter_are_found_all_the_same(
     assert rows(tmp_path, "SELECT slot, hourmeter, why FROM apart") == [((newest + 1) % 256, 5, "order")]
 
 
+@pytest.mark.parametrize("order", [HI_LO, LO_HI])
+@pytest.mark.parametrize("at_hour", [12.0, 20.0, 23.5])
+async def test_a_controller_that_lost_its_power_goes_on_with_its_history(
+    tmp_path: Path, gateway: Gateways, clock: VirtualClock, order: WordOrder, at_hour: float
+) -> None:
+    """Its hourmeter goes on from what EEPROM has since midnight, and after dusk its newest day is ahead of that."""
+    controller = unit(seed=0, start_hour=9.0, log_order=order)
+    async with gateway(controller) as running:
+        await running.until(lambda: running.stats.devices[11].harvests)
+    known = truth(controller)
+    clock.now += DAY_S + (at_hour - 9.0) * 3600.0
+    async with gateway(controller) as running:
+        await running.until(lambda: running.stats.devices[11].harvests)
+        hours = running.port.devices[0].snapshot.values["hourmeter"]
+        known |= truth(controller)
+        controller.write(Space.COILS, 0xFF, 1, clock.now)
+        await running.until(lambda: running.port.devices[0].snapshot.shown().get("hourmeter", hours) < hours)
+    async with gateway(controller) as running:
+        await running.until(lambda: running.stats.devices[11].harvests)
+        assert running.stats.devices[11].apart == 0
+    clock.now += 2 * DAY_S
+    async with gateway(controller) as running:
+        await running.until(lambda: running.stats.devices[11].harvests)
+    assert len(truth(controller).keys() - known.keys()) == 2
+    assert rows(tmp_path, "SELECT identity FROM controller") == [("shelter-a/array-1",)]
+    assert stored(tmp_path) == known | truth(controller)
+    dates = rows(tmp_path, "SELECT written_wall, error_s FROM day ORDER BY hourmeter")
+    assert all(earlier[0] < later[0] for earlier, later in pairwise(dates))
+    assert all(written <= clock.wall() for written, _ in dates)
+
+
 async def test_two_controllers_on_a_line_have_a_history_each(tmp_path: Path, gateway: Gateways) -> None:
     one, two = unit(seed=0), unit(seed=2, address=2)
     async with gateway(one, two, live_s=10.0) as running:

@@ -43,10 +43,15 @@ def test_one_wrong_hourmeter_costs_one_block(wrong: int, slot: int) -> None:
 
 
 def test_a_block_ahead_of_the_live_hourmeter_is_kept_apart() -> None:
-    blocks = full_ring(HOURS) | {9: block(HOURS[-1] + 30)}
+    blocks = full_ring(HOURS) | {9: block(HOURS[-1] + 31)}
     ring = read_ring(LAYOUT, blocks, HOURS[-1] + 5)
     assert [(found.slot, found.why) for found in ring.apart] == [(9, Why.AHEAD)]
     assert 9 not in {day.slot for day in ring.days}
+
+
+def test_a_day_from_before_the_power_was_lost_is_not_ahead() -> None:
+    ring = read_ring(LAYOUT, full_ring(HOURS), HOURS[-1] - 24)
+    assert len(ring.days) == 256
 
 
 def test_a_day_that_ended_while_the_ring_was_read_is_not_ahead() -> None:

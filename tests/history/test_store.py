@@ -92,9 +92,9 @@ def test_blocks_apart_are_told_once(store: Store) -> None:
 
 
 def test_a_block_that_turns_out_to_be_a_day_is_not_apart_any_more(store: Store) -> None:
-    early = {**RING, 100: block(HOURS[-1] + 24)}
+    early = {**RING, 100: block(HOURS[-1] + 48)}
     assert store.keep_ring(seen(LIVE), LAYOUT, early).apart == 1  # ahead of an hourmeter that hung
-    kept = store.keep_ring(seen(LIVE + 24), LAYOUT, early)
+    kept = store.keep_ring(seen(LIVE + 48), LAYOUT, early)
     assert (kept.days, kept.apart) == (101, 0)
 
 
