@@ -16,6 +16,8 @@ import asyncio
 import contextlib
 import json
 import logging
+import socket
+import struct
 from typing import cast
 
 from gateway.clock import Clock
@@ -26,6 +28,9 @@ from gateway.faces.http.wire import HEAD_BYTES, LAST_CHUNK, Fields, Head, Refusa
 
 BUSY_FACTOR = 4
 """So many times `max_connections` there can be while each of them has a request under way."""
+
+_AT_ONCE = struct.pack("ii", 1, 0)
+"""What is under way ends by a reset: nobody takes a part for the whole, and the kernel keeps nothing of it."""
 
 _log = logging.getLogger(__name__)
 
@@ -185,6 +190,10 @@ class Connection(asyncio.Protocol):
         """See `Exchange.abort`."""
         self.aborted = True
         if self._transport is not None:
+            sock = self._extra("socket")
+            if sock is not None and (self.busy or self._full):
+                with contextlib.suppress(OSError):  # it is gone already
+                    cast("socket.socket", sock).setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
             self._transport.abort()
 
     # What a handler calls.

@@ -14,7 +14,6 @@ import socket
 import ssl
 from collections.abc import Callable
 
-from gateway.faces.binding import listening_socket
 from gateway.faces.http.connection import Connection
 from gateway.faces.http.own import HttpStats
 
@@ -54,9 +53,9 @@ class Handshakes:
         host, port, *_ = self._sock.getsockname()
         return host, port
 
-    async def open(self, host: str, port: int) -> None:
-        """Listen; OSError when that cannot be."""
-        self._sock = sock = await listening_socket(host, port)
+    def open(self, sock: socket.socket) -> None:
+        """Accept what comes to a socket that listens; it is ours from now on."""
+        self._sock = sock
         asyncio.get_running_loop().add_reader(sock, self._accept)
 
     async def close(self) -> None:

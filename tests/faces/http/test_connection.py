@@ -6,6 +6,7 @@ import asyncio
 import logging
 import socket
 import struct
+from asyncio.trsock import TransportSocket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
@@ -13,8 +14,10 @@ import pytest
 
 from gateway.faces.http import connection as connection_module
 from gateway.faces.http.connection import BUSY_FACTOR, Connection
+from gateway.faces.http.listener import SEND_BUFFER
 from gateway.faces.http.request import Reply, Request
 from gateway.faces.http.wire import HEAD_BYTES, Head, Refusal, take
+from gateway.service.loops import Loop, loop_factory
 
 from .conftest import Gateway
 from .test_listener import still_open, strangers
@@ -243,6 +246,49 @@ async def test_where_all_are_busy_one_that_takes_no_reply_makes_room(
         assert made[1].aborted
         for connection in tuple(connections._live):
             connection.connection_lost(None)
+
+
+@pytest.mark.parametrize("choice", [Loop.ASYNCIO, Loop.UVLOOP])
+@pytest.mark.parametrize("version", ["1.0", "1.1"])
+def test_a_reply_that_is_broken_off_is_not_taken_for_a_whole_one(
+    make_gateway: MakeGateway, monkeypatch: pytest.MonkeyPatch, version: str, choice: Loop
+) -> None:
+    """A client of HTTP/1.0 knows nothing of chunks: to it an orderly end is the end of the reply."""
+    if choice is Loop.UVLOOP:
+        pytest.importorskip("uvloop")
+    with asyncio.Runner(loop_factory=loop_factory(choice)) as runner:
+        runner.run(_broken_off(make_gateway, monkeypatch, version))
+
+
+async def _broken_off(make_gateway: MakeGateway, monkeypatch: pytest.MonkeyPatch, version: str) -> None:
+    taken = asyncio.Event()
+
+    async def part(request: Request) -> None:
+        request.by.begin(())
+        await request.by.write(b"the first half")
+        await taken.wait()
+        request.by.abort()
+
+    async with make_gateway().running() as gateway:
+        monkeypatch.setitem(gateway.face._pages, "/part", part)
+        async with strangers(gateway, 1, get("/part", version=version)) as [(reader, _)], asyncio.timeout(10):
+            await reader.readuntil(b"the first half")
+            taken.set()
+            with pytest.raises(ConnectionResetError):
+                await reader.read()
+
+
+async def test_what_a_client_leaves_in_the_kernel_is_little(gateway: Gateway) -> None:
+    """The kernel would keep megabytes for each connection, and all connections of the machine share what it has."""
+    connections = gateway.face.listeners[0]._connections
+    assert connections is not None
+    async with strangers(gateway, 1), asyncio.timeout(10):
+        while not connections._live:  # noqa: ASYNC110  as above
+            await asyncio.sleep(0.001)
+        [connection] = connections._live
+        sock = connection._extra("socket")
+        assert isinstance(sock, TransportSocket)
+        assert sock.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF) <= 2 * SEND_BUFFER
 
 
 async def test_stopping_lets_a_reply_under_way_go_out(
