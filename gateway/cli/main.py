@@ -22,6 +22,7 @@ def main() -> None:
         signal.signal(number, _leave)
     _mend_streams()
     if sys.argv[1:2] == ["run"]:
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})  # it waits until service/process.py can reload
         from gateway.cli.running import plain_arguments, run  # noqa: PLC0415 - only now are signals handled
 
         arguments = plain_arguments(sys.argv[2:])

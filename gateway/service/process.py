@@ -6,7 +6,8 @@ Rule 1: the first SIGTERM or SIGINT stops in order (service/supervisor.py), the 
         Threads that still wait then for a disk, or a file system that is gone, are waited for `LEAVE_S`, no longer.
 Rule 2: when a part fails again and again, the gateway stops in the same order and leaves exit status 70, upon which
         systemd starts it anew.
-Rule 3: SIGHUP has the configuration read again, and every file that it names (service/reload.py).
+Rule 3: SIGHUP has the configuration read again, and every file that it names (service/reload.py). One that comes while
+        the gateway starts waits until then (cli/main.py blocks it).
 """
 
 from __future__ import annotations
@@ -61,6 +62,7 @@ async def _serve(path: Path, config: Config, log: Log) -> int:
     reloader = Reloader(path, gateway, clock, systemd, log)
     gateway.keep(reloader)
     _on(signal.SIGHUP, running, reloader.wanted)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGHUP})
     for text in advice(config, line_budgets(config)):
         _log.warning('event=advice text="%s"', text.replace('"', "'"))
     _log.info(

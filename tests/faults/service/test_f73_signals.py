@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 import time
 
@@ -61,3 +62,20 @@ async def test_a_signal_at_any_moment_of_the_start_ends_it_quietly(service: Serv
         await asyncio.sleep(part * whole_s)
         assert await service.end(number) == 0
         assert "Traceback" not in program.log()
+
+
+async def test_a_reload_that_is_wanted_while_it_starts_is_made_then(service: Service) -> None:
+    service.configure()
+    text = service.config.read_bytes()
+    service.config.unlink()
+    os.mkfifo(service.config)
+    program = service.start()
+    writing = await asyncio.to_thread(os.open, service.config, os.O_WRONLY)  # it is being read
+    program.process.send_signal(signal.SIGHUP)
+    service.config.unlink()
+    service.config.write_bytes(text)
+    os.write(writing, text)
+    os.close(writing)
+    await service.log("event=started")
+    await service.log("event=reloaded")
+    assert await service.end() == 0
