@@ -106,6 +106,7 @@ class HistoryKeeper:
         self._store = AsyncStore(settings.directory, clock, stats, executor)
         self._budget = LogBudget(window_s=3600.0)
         self._clock_offset = clock.wall() - awake_s()
+        self._minding = asyncio.Lock()
         self._lines: list[list[_Watch]] = []
         for line in site.lines:
             watches = [self._watch(device) for device in site.devices if device.line is line]
@@ -331,15 +332,16 @@ class HistoryKeeper:
             )  # fmt: skip
 
     async def _mind_the_clock(self) -> None:
-        """Rule 4."""
-        offset = self._clock.wall() - self._awake_s()
-        step_s = offset - self._clock_offset
-        if abs(step_s) < CLOCK_STEP_S:
-            return
-        keys = [w.controller for watches in self._lines for w in watches if w.controller is not None]
-        moved = await self._store.call(Store.shift, keys, step_s)
-        self._clock_offset = offset
-        _log.warning("event=history_clock_set step_s=%.0f days_moved=%d", step_s, moved)
+        """Rule 4; of several lines that see the same step the first one moves the dates."""
+        async with self._minding:
+            offset = self._clock.wall() - self._awake_s()
+            step_s = offset - self._clock_offset
+            if abs(step_s) < CLOCK_STEP_S:
+                return
+            keys = [w.controller for watches in self._lines for w in watches if w.controller is not None]
+            moved = await self._store.call(Store.shift, keys, step_s)
+            self._clock_offset = offset
+            _log.warning("event=history_clock_set step_s=%.0f days_moved=%d", step_s, moved)
 
 
 def _who(seen: Seen) -> Who:

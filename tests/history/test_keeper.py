@@ -365,6 +365,22 @@ async def test_the_dates_follow_a_clock_that_is_set(tmp_path: Path, gateway: Gat
         assert at == pytest.approx(clock.wall(), abs=120)
 
 
+async def test_a_clock_that_is_set_is_set_once_however_many_lines_there_are(
+    tmp_path: Path, gateway: Gateways, clock: VirtualClock
+) -> None:
+    running = gateway(unit(seed=0))
+    for _ in range(3):  # lines with nothing to do look at the clock in step
+        others = [running.keeper._watch(device) for device in VirtualPort(clock, [unit()], 5.0).devices]
+        running.keeper._lines.append([other for other in others if other is not None])
+    async with running:
+        await running.until(lambda: running.stats.devices[11].harvests)
+        before = rows(tmp_path, "SELECT hourmeter, written_wall FROM day")
+        clock.wall_offset += 5 * DAY_S
+        await running.run(20.0)
+        after = rows(tmp_path, "SELECT hourmeter, written_wall FROM day")
+    assert after == [(hours, pytest.approx(at + 5 * DAY_S, abs=1.0)) for hours, at in before]
+
+
 async def test_the_sleep_of_the_machine_is_no_step_of_the_clock(
     tmp_path: Path, gateway: Gateways, clock: VirtualClock
 ) -> None:
