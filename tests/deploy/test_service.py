@@ -92,7 +92,7 @@ def test_a_bad_configuration_is_not_tried_again() -> None:
 def test_a_reload_that_is_refused_fails(tmp_path: Path) -> None:
     """The signal goes out first, so that the gateway counts and logs it; systemd goes by the last exit status."""
     signal, check = settings(UNIT.name)["ExecReload"]
-    assert signal == "/bin/kill -HUP $MAINPID"
+    assert signal == '/bin/sh -c "kill -HUP $MAINPID"'
     before, program, arguments = check.partition(f" {PROGRAM} ")
     assert program
     assert before == f"/usr/bin/env {CREDENTIALS}"
