@@ -42,11 +42,12 @@ point() {
 # release NAME: the folder that a link names; nothing when there is none.
 release() { [[ ! -L $home/$1 ]] || readlink -f "$home/$1"; }
 
+# find_python: python3.11, say, and not python3, which is another one after an upgrade of Debian and has no libraries then.
 find_python() {
   local candidate
   for candidate in ${PYTHON:-python3 python3.11 python3.12 python3.13 python3.14}; do
     if "$candidate" -c 'import sys, ensurepip, venv; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then
-      echo "$candidate"
+      "$candidate" -c 'import os, sys; print(os.path.realpath(sys.executable))'
       return
     fi
   done
@@ -134,6 +135,8 @@ rollback() {
   local now before
   now=$(release current) before=$(release previous)
   [[ -n $before && -d $before ]] || fail 'there is no earlier release'
+  "$before/bin/prostar-gateway" --version >/dev/null 2>&1 ||
+    fail "$(basename "$before") does not run here any more (its Python is gone?); nothing was changed"
   point current "$before"
   point previous "$now"
   place_files "$before"

@@ -43,13 +43,15 @@ STORY = (
 for what looks at the rehearsal, which tests/docs/test_blocks.py runs."""
 
 
-def install(clone: Path, destination: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def install(
+    clone: Path, destination: Path, *arguments: str, python: str | Path = sys.executable
+) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         ["bash", str(clone / SCRIPT), *arguments],
         capture_output=True,
         text=True,
         check=False,
-        env={**os.environ, "DESTDIR": str(destination), "PYTHON": sys.executable},
+        env={**os.environ, "DESTDIR": str(destination), "PYTHON": str(python)},
         umask=0o077,  # as root has it on machines that are kept tight
     )
 
@@ -82,6 +84,23 @@ def test_there_is_nothing_to_go_back_to(tmp_path: Path) -> None:
     assert "there is no earlier release" in done.stderr
 
 
+def test_what_does_not_run_any_more_is_not_gone_back_to(tmp_path: Path) -> None:
+    """After an upgrade of Debian its Python may be gone."""
+    home = tmp_path / "opt" / "prostar-gateway"
+    for name in ("current", "previous"):
+        program = home / "releases" / f"the-{name}" / "bin" / "prostar-gateway"
+        program.parent.mkdir(parents=True)
+        program.write_text("#!/usr/bin/python3.2\n")
+        program.chmod(0o755)
+        (home / name).symlink_to(f"releases/the-{name}")
+    done = install(ROOT, tmp_path, "rollback")
+    assert done.returncode == 1
+    assert "the-previous does not run here any more" in done.stderr
+    for name in ("current", "previous"):
+        assert (home / name).readlink() == Path("releases", f"the-{name}")
+    assert list(tmp_path.iterdir()) == [tmp_path / "opt"]
+
+
 def test_removing_what_is_not_there_does_no_harm(tmp_path: Path) -> None:
     assert install(ROOT, tmp_path, "remove").returncode == 0
 
@@ -112,8 +131,10 @@ def test_from_installation_to_removal(
         return subprocess.run([command, *arguments], capture_output=True, text=True, check=True, cwd="/").stdout
 
     # Install: everything is in place, with a configuration to begin with.
-    done = install(clone, machine)
+    (tmp_path / "python3").symlink_to(os.path.realpath(sys.executable))
+    done = install(clone, machine, python=tmp_path / "python3")
     assert done.returncode == 0, done.stderr
+    (tmp_path / "python3").unlink()  # what a newer Debian calls python3 is another Python
     assert all((machine / path).exists() for path in PLACED)
     assert config.read_text() == (ROOT / "config" / "minimal.toml").read_text()
     assert "is right" in gateway("check-config", "-c", str(config))
