@@ -68,14 +68,16 @@ def test_looks_that_contradict_each_other_widen_the_bound() -> None:
 
 
 @given(
-    hours=st.floats(1000, 2000), ran=st.floats(0, 24), kept=st.floats(0, 24), on=st.floats(0, 24), off=st.floats(0, 9)
+    hours=st.floats(1000, 2000), ran=st.floats(0, 20), share=st.floats(0, 1), lost=st.floats(2, 24), off=st.floats(0, 9)
 )
 def test_a_day_from_before_the_power_was_lost_is_within_the_bound(
-    hours: float, ran: float, kept: float, on: float, off: float
+    hours: float, ran: float, share: float, lost: float, off: float
 ) -> None:
     """Written `ran` hours before that, while EEPROM had what was `kept` hours old; then `off`, then `on` again."""
+    on = share * (20 - ran)
+    kept = min(24.0, ran + on + lost)
     now = Look(int(hours + ran - kept + on), WALL + (hours + ran + off + on) * HOUR_S)
-    assume(int(hours) > now.hours + 1)
+    assert int(hours) > now.hours + 1
     for before in (None, look_at(hours - 30)):
         found = estimate(int(hours), now, before)
         assert found is not None
