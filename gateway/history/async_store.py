@@ -12,7 +12,6 @@ import asyncio
 import functools
 import json
 import logging
-import secrets
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from pathlib import Path
@@ -40,8 +39,15 @@ class AsyncStore:
     """A `Store` for coroutines. `opened` counts how often it was opened: what was known of its content may be wrong."""
 
     def __init__(
-        self, directory: Path, clock: Clock, stats: HistoryStats, executor: Callable[[], Executor] = one_thread
+        self,
+        directory: Path,
+        clock: Clock,
+        stats: HistoryStats,
+        executor: Callable[[], Executor] = one_thread,
+        *,
+        session: int,
     ) -> None:
+        """`session` as a `Store` wants it."""
         self.opened = 0
         self._directory = directory
         self._clock = clock
@@ -52,7 +58,7 @@ class AsyncStore:
         self._busy = asyncio.Lock()
         self._retry_at = float("-inf")
         self._trouble: tuple[str, float] | None = None  # message, since
-        self._session = secrets.randbits(62)
+        self._session = session
 
     async def ready(self) -> bool:
         """Whether it can be used; opens it when it is time to try."""

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -33,6 +32,7 @@ from gateway.history.harvest import Harvest
 from gateway.history.harvest import Outcome as Ending
 from gateway.history.identity import Place, Seen
 from gateway.history.schedule import DAY_HOURS, Schedule, Who
+from gateway.history.session import Session, awake_s
 from gateway.history.settings import HistorySettings
 from gateway.history.store import Kept, Plan, Store
 
@@ -45,12 +45,6 @@ LONG_S = 600.0
 
 _AWAY = (DeviceOffline, PathUnavailable, ShuttingDown)
 _log = logging.getLogger(__name__)
-
-
-def _awake_s() -> float:
-    """Seconds from an arbitrary start, the machine's sleep included where the system can tell."""
-    boot = getattr(time, "CLOCK_BOOTTIME", None)
-    return time.monotonic() if boot is None else time.clock_gettime(boot)
 
 
 class _Interrupted(Exception):
@@ -95,18 +89,21 @@ class HistoryKeeper:
         *,
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
         executor: Callable[[], Executor] = one_thread,
-        awake_s: Callable[[], float] = _awake_s,
+        awake_s: Callable[[], float] = awake_s,
+        session: Session | None = None,
     ) -> None:
-        """`awake_s` is a clock that never steps and does not stop while the machine sleeps."""
+        """`awake_s` is a clock that never steps and does not stop while the machine sleeps.
+
+        `session` is that of the keeper before; left out: this one is the first.
+        """
         self._settings = settings
         self._clock = clock
         self._stats = stats
         self._sleep = sleep
         self._awake_s = awake_s
-        self._store = AsyncStore(settings.directory, clock, stats, executor)
+        self._session = Session.begin(clock, awake_s) if session is None else session
+        self._store = AsyncStore(settings.directory, clock, stats, executor, session=self._session.number)
         self._budget = LogBudget(window_s=3600.0)
-        self._clock_offset = clock.wall() - awake_s()
-        self._minding = asyncio.Lock()
         self._lines: list[list[_Watch]] = []
         for line in site.lines:
             watches = [self._watch(device) for device in site.devices if device.line is line]
@@ -299,6 +296,7 @@ class HistoryKeeper:
         now = self._clock.monotonic()
         kept, controller = result.kept, result.kept.controller
         watch.controller = controller.key
+        self._session.controllers.add(controller.key)
         watch.stats.days, watch.stats.apart = kept.days, kept.apart
         if result.whole:
             watch.stats.harvests += 1
@@ -333,14 +331,18 @@ class HistoryKeeper:
 
     async def _mind_the_clock(self) -> None:
         """Rule 4; of several lines that see the same step the first one moves the dates."""
-        async with self._minding:
-            offset = self._clock.wall() - self._awake_s()
-            step_s = offset - self._clock_offset
+        session = self._session
+        async with session.minding:
+            offset, before = self._clock.wall() - self._awake_s(), session.clock_offset
+            step_s = offset - before
             if abs(step_s) < CLOCK_STEP_S:
                 return
-            keys = [w.controller for watches in self._lines for w in watches if w.controller is not None]
-            moved = await self._store.call(Store.shift, keys, step_s)
-            self._clock_offset = offset
+            session.clock_offset = offset  # a keeper that ends now leaves no dates half moved: its store goes on
+            try:
+                moved = await self._store.call(Store.shift, tuple(session.controllers), step_s)
+            except HistoryError:
+                session.clock_offset = before
+                raise
             _log.warning("event=history_clock_set step_s=%.0f days_moved=%d", step_s, moved)
 
 

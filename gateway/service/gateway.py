@@ -25,6 +25,7 @@ from gateway.faces.snmp.agent import SnmpAgent
 from gateway.faces.snmp.log_keeper import LogKeeper
 from gateway.faces.snmp.settings import SnmpSettings
 from gateway.history.keeper import HistoryKeeper
+from gateway.history.session import Session
 from gateway.history.source import HistorySource
 from gateway.lines.factory import Line
 from gateway.service.conditions import ConditionKeeper
@@ -70,6 +71,7 @@ class Gateway:
         self._modbus_stats = ModbusServerStats()
         self._modbus = ModbusServer(modbus_settings(config), self.site, clock, self._modbus_stats)
         self._history = HistoryStats() if config.history.enabled else None
+        self._history_session = Session.begin(clock)
         kept = history_settings(config)
         self._watching = ConditionKeeper(
             self.site, clock, not_ready=self.not_ready, history=self._history, state_dir=kept.directory
@@ -281,4 +283,5 @@ class Gateway:
     def _harvester(self, config: Config, site: Site) -> tuple[HistoryKeeper, ...]:
         if self._history is None:
             return ()
-        return (HistoryKeeper(history_settings(config), site, self._clock, self._history),)
+        settings, session = history_settings(config), self._history_session
+        return (HistoryKeeper(settings, site, self._clock, self._history, session=session),)

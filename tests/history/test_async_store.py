@@ -38,7 +38,7 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> type[SlowStore]:
 
 
 async def test_one_that_is_opened_when_nobody_waits_any_more_is_closed(slow: type[SlowStore], tmp_path: Path) -> None:
-    store = AsyncStore(tmp_path, SystemClock(), HistoryStats())
+    store = AsyncStore(tmp_path, SystemClock(), HistoryStats(), session=1)
     opening = asyncio.create_task(store.ready())
     async with asyncio.timeout(30):
         while not slow.made:  # noqa: ASYNC110 - it is another thread that opens it
@@ -52,7 +52,7 @@ async def test_one_that_is_opened_when_nobody_waits_any_more_is_closed(slow: typ
 
 
 async def test_one_that_is_in_use_is_closed_with_it(slow: type[SlowStore], tmp_path: Path) -> None:
-    store = AsyncStore(tmp_path, SystemClock(), HistoryStats())
+    store = AsyncStore(tmp_path, SystemClock(), HistoryStats(), session=1)
     slow.may_open.set()
     assert await store.ready()
     await store.close()

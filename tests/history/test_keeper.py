@@ -16,6 +16,7 @@ from gateway.devices.log import decode_log, split_blocks
 from gateway.devices.model import Space, WordOrder
 from gateway.errors import HistoryError
 from gateway.history.database import FILE_NAME
+from gateway.history.session import Session
 from gateway.history.store import Store
 from gateway.simulator.device import SimulatedController
 from gateway.simulator.server import missing
@@ -379,6 +380,25 @@ async def test_a_clock_that_is_set_is_set_once_however_many_lines_there_are(
         await running.run(20.0)
         after = rows(tmp_path, "SELECT hourmeter, written_wall FROM day")
     assert after == [(hours, pytest.approx(at + 5 * DAY_S, abs=1.0)) for hours, at in before]
+
+
+async def test_what_the_keeper_before_dated_is_moved_too(
+    tmp_path: Path, gateway: Gateways, clock: VirtualClock
+) -> None:
+    """A reload, or a model that was found, begins another keeper in the same run of the gateway."""
+    controller, session = unit(seed=0), Session.begin(clock, clock.monotonic)
+    async with gateway(controller, session=session) as running:
+        await running.until(lambda: running.stats.devices[11].harvests)
+    before = rows(tmp_path, "SELECT hourmeter, written_wall FROM day")
+    clock.wall_offset += 5 * DAY_S
+    async with gateway(controller, session=session) as running:
+        await running.run(20.0)
+    after = rows(tmp_path, "SELECT hourmeter, written_wall FROM day")
+    assert after == [(hours, pytest.approx(at + 5 * DAY_S, abs=1.0)) for hours, at in before]
+    async with gateway(controller) as running:  # another run: its clock was right from the start
+        clock.wall_offset -= DAY_S
+        await running.run(20.0)
+    assert rows(tmp_path, "SELECT hourmeter, written_wall FROM day") == after
 
 
 async def test_the_sleep_of_the_machine_is_no_step_of_the_clock(

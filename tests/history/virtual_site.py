@@ -17,6 +17,7 @@ from gateway.core.settings import LineSettings, PollSettings
 from gateway.core.site import Device, LineStatus, Outcome, Site, Ticket
 from gateway.core.stats import HistoryStats, LineStats
 from gateway.history.keeper import HistoryKeeper
+from gateway.history.session import Session
 from gateway.history.settings import HistorySettings
 from gateway.simulator.line import SimulatedLine, Station
 from tests.history.blocks import MAP
@@ -106,7 +107,14 @@ class VirtualPort:
 class VirtualGateway:
     """One run of a gateway: `async with`, then `run(seconds)`; may be left and entered again with the same parts."""
 
-    def __init__(self, directory: Path, clock: VirtualClock, port: VirtualPort, interval_s: float = 86400.0) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        clock: VirtualClock,
+        port: VirtualPort,
+        interval_s: float = 86400.0,
+        session: Session | None = None,
+    ) -> None:
         self.clock = clock
         self.port = port
         self.stats = HistoryStats()
@@ -120,6 +128,7 @@ class VirtualGateway:
             sleep=self._sleep,
             executor=InlineExecutor,
             awake_s=clock.monotonic,
+            session=session,
         )
         self._task: asyncio.Task[None] | None = None
 

@@ -14,6 +14,7 @@ import pytest
 from gateway.clock import SystemClock
 from gateway.errors import ConfigError
 from gateway.faces.snmp.agent import SnmpAgent
+from gateway.history.keeper import HistoryKeeper
 from gateway.service.config import Config, parse_config
 from gateway.service.gateway import Gateway
 from gateway.service.logs import Log
@@ -102,6 +103,18 @@ async def test_the_same_configuration_changes_no_object(site: Site) -> None:
         await change(gateway, site.config(A, B, FACES, COMMUNITY))
         assert (gateway.site, gateway.lines, gateway.listeners, gateway.keepers, gateway.conditions) == before
         assert gateway.not_ready() == ()
+
+
+async def test_to_the_history_it_is_the_same_run(site: Site) -> None:
+    def keeper(gateway: Gateway) -> HistoryKeeper:
+        (found,) = [each for each in gateway.keepers if isinstance(each, HistoryKeeper)]
+        return found
+
+    async with running(site.config(A, FACES)) as gateway:
+        before = keeper(gateway)
+        await change(gateway, site.config(A, B, FACES))
+        assert keeper(gateway) is not before
+        assert keeper(gateway)._session is before._session
 
 
 async def test_a_line_more_keeps_the_others_and_all_listeners(site: Site) -> None:
