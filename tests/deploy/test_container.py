@@ -115,6 +115,12 @@ def test_the_quadlet_runs_what_the_page_runs() -> None:
             assert re.search(rf"^PodmanArgs=.*{re.escape(option)} {re.escape(value)}", text, re.MULTILINE), option
 
 
+def test_the_quadlet_logs_to_the_journal_that_the_gateway_knows_by_its_variable() -> None:
+    text = QUADLET.read_text()
+    assert "\nLogDriver=passthrough\nPodmanArgs=--env JOURNAL_STREAM\n" in text
+    assert '"JOURNAL_STREAM"' in (ROOT / "gateway" / "service" / "log_writer.py").read_text()
+
+
 def test_the_quadlet_ends_and_begins_as_the_service_does() -> None:
     unit = (ROOT / "deploy" / "systemd" / "prostar-gateway.service").read_text()
     for key in ("StartLimitIntervalSec", "Restart", "RestartSec", "RestartPreventExitStatus", "TimeoutStopSec"):
