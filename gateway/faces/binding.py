@@ -25,8 +25,12 @@ def bind_problem(error: OSError) -> str:
     return _REASONS.get(number) or (os.strerror(number) if number > 0 else error.strerror or str(error))
 
 
-async def listening_socket(host: str, port: int) -> socket.socket:
-    """A socket that listens on one address of one family; OSError when it cannot be had."""
+async def listening_socket(host: str, port: int, *, send_buffer: int) -> socket.socket:
+    """A socket that listens on one address of one family; OSError when it cannot be had.
+
+    Of what is sent to a client that it accepts, the kernel keeps about `send_buffer` octets until the client takes
+    them. By itself it would keep megabytes, out of the memory that all connections of the machine share.
+    """
     loop = asyncio.get_running_loop()
     (family, kind, protocol, _, address), *_ = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     sock = socket.socket(family, kind, protocol)
@@ -35,6 +39,7 @@ async def listening_socket(host: str, port: int) -> socket.socket:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         if family == socket.AF_INET6:
             sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, send_buffer)  # which accepted ones inherit
         sock.bind(address)
         sock.listen(BACKLOG)
     except BaseException:

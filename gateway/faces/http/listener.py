@@ -7,7 +7,6 @@ With TLS a connection counts from the end of its handshake; as many more may be 
 from __future__ import annotations
 
 import asyncio
-import socket
 import ssl
 from collections.abc import Callable
 
@@ -22,7 +21,7 @@ from gateway.faces.http.request import Handler
 from gateway.faces.http.settings import HttpSettings
 
 SEND_BUFFER = 128 * 1024
-"""Octets that a connection leaves in the kernel, about: enough for ten megabits a second over a tenth of a second."""
+"""Octets on the way to a client: enough for ten megabits a second over a tenth of a second."""
 
 
 class HttpListener:
@@ -72,8 +71,7 @@ class HttpListener:
             raise ListenError(f"{self.label}: {error}") from None
         self._connections = connections = Connections(self._settings, handler, self._clock, self._stats)
         try:
-            sock = await listening_socket(self._host, self._port)
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)  # as all that it accepts
+            sock = await listening_socket(self._host, self._port, send_buffer=SEND_BUFFER)
             if tls is None:
                 self._server = await asyncio.get_running_loop().create_server(self._accept, sock=sock, backlog=BACKLOG)
             else:

@@ -45,6 +45,9 @@ if TYPE_CHECKING:  # 9 MiB that only sites with TLS pay
 
 logger = logging.getLogger(__name__)
 
+SEND_BUFFER = 64 * 1024
+"""Octets on the way to a client: 250 of the longest replies."""
+
 
 class Listener:
     """One listening address and the connections that came through it; with a `door`, through TLS."""
@@ -88,7 +91,7 @@ class Listener:
         try:
             if self._door is not None:
                 self._door.open()
-            sock = await listening_socket(self._host, self._port)
+            sock = await listening_socket(self._host, self._port, send_buffer=SEND_BUFFER)
         except TlsFilesError as error:
             raise ListenError(f"{self.label}: {error}") from error
         except OSError as error:

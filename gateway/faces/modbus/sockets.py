@@ -23,7 +23,9 @@ import asyncio
 import os
 import select
 import socket
+import struct
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 TURN = 128
@@ -122,6 +124,9 @@ class Hub:
                 call(events)
 
 
+_AT_ONCE = struct.pack("ii", 1, 0)
+"""A reset, and not an orderly end behind all that was sent."""
+
 _NOBODY = asyncio.Protocol()
 """Whom a transport that ended tells nothing."""
 
@@ -216,7 +221,10 @@ class SocketTransport(asyncio.Transport):
             self._drop(None)
 
     def abort(self) -> None:
-        """End the connection now."""
+        """End the connection now; what the client did not take is thrown away, by the kernel as well."""
+        if self._rest:
+            with suppress(OSError):  # it is gone already
+                self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
         self._closing = True
         self._drop(None)
 

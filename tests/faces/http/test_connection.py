@@ -279,7 +279,6 @@ async def _broken_off(make_gateway: MakeGateway, monkeypatch: pytest.MonkeyPatch
 
 
 async def test_what_a_client_leaves_in_the_kernel_is_little(gateway: Gateway) -> None:
-    """The kernel would keep megabytes for each connection, and all connections of the machine share what it has."""
     connections = gateway.face.listeners[0]._connections
     assert connections is not None
     async with strangers(gateway, 1), asyncio.timeout(10):

@@ -98,6 +98,11 @@ def descriptor_count() -> int:
     return len(list(Path("/proc/self/fd").iterdir()))
 
 
+def read_to_the_end(sock: socket.socket) -> None:
+    while sock.recv(1 << 20):
+        pass
+
+
 def reset(sock: socket.socket) -> None:
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
     sock.close()
@@ -307,6 +312,17 @@ async def test_a_busy_client_does_not_keep_the_loop_from_others(hub: Hub, opened
     await recorders[-1].lost.wait()
 
 
+async def test_what_is_not_taken_is_thrown_away_with_the_connection(pair: Pair) -> None:
+    """Otherwise the kernel would keep it, and try for minutes to have a client that reads nothing take it."""
+    recorder, transport, far = pair
+    while "pause" not in recorder.told:
+        transport.write(bytes(65536))
+    transport.abort()
+    await recorder.lost.wait()
+    with pytest.raises(ConnectionResetError):
+        await asyncio.to_thread(read_to_the_end, far)
+
+
 async def test_the_hub_is_gone_with_its_last_descriptor(pair: Pair, hub: Hub) -> None:
     recorder, transport, _ = pair
     descriptors = descriptor_count()
@@ -320,7 +336,7 @@ async def test_f81_without_descriptors_accepting_pauses_and_goes_on(
     hub: Hub, opened: list[socket.socket], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     taken: list[socket.socket] = []
-    listening = await listening_socket("127.0.0.1", 0)
+    listening = await listening_socket("127.0.0.1", 0, send_buffer=4096)
     acceptor = Acceptor(hub, listening, "modbus here", lambda sock, _: taken.append(sock))
     with monkeypatch.context() as patch:
         patch.setattr("gateway.faces.modbus.accepting.SPARE_DESCRIPTORS", 1 << 30)
