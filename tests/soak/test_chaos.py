@@ -27,6 +27,8 @@ SAMPLES = 30
 CLIENTS = 8
 RATES = {**all_at(0.01), Fault.CLOSE: 0.0005, Fault.UNPLUG: 0.0005}
 MOST_GROWTH_KIB = 2048
+LEAST_REPLIES = 5 * SOAK_S
+"""With data; a dozen a second come once late replies made the lines wait up to 2 s after a failure (quarantine.py)."""
 
 
 async def look(site: Site, snmpbulkwalk: str, until: float, seen: Counter[str]) -> None:
@@ -94,7 +96,7 @@ async def test_everything_at_once(
     faults = sum((chaos.counts for chaos in site.chaos), Counter[Fault]())
     codes = sum((client.codes for client in clients), Counter[int]())
     assert [wrong for client in clients for wrong in client.wrong] == []
-    assert codes[0] > 20 * SOAK_S
+    assert codes[0] > LEAST_REPLIES
     assert set(faults) >= set(Fault) - {Fault.CLOSE, Fault.UNPLUG}
     assert seen["walks"] >= SOAK_S / 30
     assert seen["scrapes"] >= SOAK_S / 30
