@@ -66,15 +66,28 @@ async def test_ten_thousand_requests_a_second_keep_nobody_waiting_longer_than_a_
     other = await running.connect(local_addr=("127.0.0.2", 0))
     clients = {client.name: client for client in running.server.clients}
     flooding = clients["127.0.0.9"]
+    answered_at: list[int] = []  # how much had been asked by the flood when the other was answered
+
+    (served,) = (each for each in running.server._connections if each.peer == "127.0.0.2")
+    write = served._write
+
+    def noted(data: bytes) -> None:
+        answered_at.append(flooding.requests)
+        write(data)
+
+    served._write = noted
     ahead = []
     for tick in range(300):  # three seconds
         if tick % 100 == 0:
             world.poll(12)
-        flood.send(ready(world, 100))
+        flood.send(ready(world, 100 if tick > 1 else 4 * TURN))  # at first, and once all is known, more than a turn
         before = flooding.requests
         assert await other.query(12, READ_1, tick) == b"\x03\x02" + registers(2, 0, 1)
-        ahead.append(flooding.requests - before)
+        ahead.append(answered_at.pop() - before)
+        if tick == 0:
+            await flood.adus(4 * TURN)
         world.clock.now += 0.01
+    assert ahead[0] > TURN / 2 < ahead[1], "as much as may be, before and after all is known"
     assert max(ahead) <= TURN, "one turn of the loop"
     bucket = rates.client.requests_per_s * rates.burst_s
     assert bucket <= flooding.requests <= bucket + 3 * rates.client.requests_per_s + flooding.limited
