@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -247,3 +248,16 @@ def test_a_receiver_of_what_is_critical() -> None:
     post.send_all()
     post.shows(alarms=1 | 1 << 17)
     assert len(post.send_all()) == 1
+
+
+def test_a_trap_that_the_system_does_not_take_is_tried_ever_more_seldom() -> None:
+    post = Post(inform=False)
+    tried = []
+    for second in range(300):
+        if post.send(works=False):
+            tried.append(second)
+        post.plant.wait(1)
+    assert [later - earlier for earlier, later in pairwise(tried)] == [2, 4, 8, 16, 32, 60, 60, 60]
+    post.plant.wait(60)
+    assert len(post.send()) == 1
+    assert post.stats.failures == len(tried)
