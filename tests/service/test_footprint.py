@@ -9,7 +9,7 @@ from __future__ import annotations
 import pytest
 
 from gateway.faces.snmp import answers, reader
-from tests.service.memory_rig import MOMENTS, Controllers, allocated, snapshots, traced
+from tests.service.memory_rig import MOMENTS, Controllers, allocated, forget_numbers, snapshots, traced
 
 
 async def test_what_was_asked_at_different_times_keeps_no_old_snapshot() -> None:
@@ -26,6 +26,7 @@ async def test_what_was_asked_at_different_times_keeps_no_old_snapshot() -> None
 
 
 async def test_memory_is_flat_once_everything_was_asked_for() -> None:
+    forget_numbers()
     site = Controllers(2)
     with traced():
         for moment in range(2 * MOMENTS):
