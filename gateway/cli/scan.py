@@ -85,16 +85,17 @@ def command(
 
 
 def _upstream(port: str) -> UpstreamSettings | None:
+    """Where a `tcp://` port leads, None of any other; BadParameter for a URL that leads nowhere."""
     parts = urlsplit(port)
-    if parts.scheme != "tcp":
+    if parts.scheme not in {"tcp", "socket", "rfc2217"}:
         return None
     try:
         host, number = parts.hostname, parts.port
     except ValueError:
         host = number = None
     if not host or not number:
-        raise typer.BadParameter(f"{port} is not tcp://host:port")
-    return UpstreamSettings(host, number)
+        raise typer.BadParameter(f"{port} is not {parts.scheme}://host:port")
+    return UpstreamSettings(host, number) if parts.scheme == "tcp" else None
 
 
 def _scan_tcp(

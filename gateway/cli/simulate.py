@@ -25,6 +25,7 @@ from gateway.simulator.tcp import TcpServer
 from gateway.simulator.upstream import Habits, SimulatedServer
 
 MODEL = "prostar-mppt"
+HIGHEST_PORT = 65535
 
 
 def command(
@@ -73,6 +74,7 @@ def command(
     try:
         _check(tcp, link_dir, closes=close_after_reply)
         plans = _plans(line, lines, devices)
+        _check_ports(tcp or 0, len(plans))
         behaviour = Behaviour(seed, speed, start_hour, turnaround_ms / 1000, oracle)
         site = SimulatedSite.build(load_map(model), plans, behaviour, link_dir)
     except (ValueError, MapError) as error:
@@ -90,6 +92,11 @@ def _check(tcp: int | None, link_dir: Path | None, *, closes: bool) -> None:
         raise ValueError("--close-after-reply needs --tcp")
     if tcp is not None and link_dir is not None:
         raise ValueError("--tcp and --link-dir exclude each other")
+
+
+def _check_ports(first: int, lines: int) -> None:
+    if first + lines - 1 > HIGHEST_PORT:
+        raise ValueError(f"--tcp {first} leaves no ports for {lines} lines; the highest is {HIGHEST_PORT}")
 
 
 def _plans(line: list[str] | None, lines: int | None, devices: int) -> tuple[LinePlan, ...]:

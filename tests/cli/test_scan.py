@@ -258,6 +258,13 @@ def test_what_cannot_be_asked_is_said(arguments: tuple[str, str], complaint: str
     assert complaint in result.stderr
 
 
+@pytest.mark.parametrize("port", ["tcp://host", "tcp://host:70000", "socket://host", "socket://:1", "rfc2217://host:0"])
+def test_a_port_that_leads_nowhere_is_said(port: str) -> None:
+    result = CliRunner(env={"COLUMNS": "200", "NO_COLOR": "1"}).invoke(app, ["scan", port])
+    assert result.exit_code == 2
+    assert f"{port} is not {port.partition(':')[0]}://host:port" in result.stderr
+
+
 def test_numbers_keep_their_order_and_come_once() -> None:
     assert _numbers("9600, 1-3,2", 1, 10000) == [9600, 1, 2, 3]
 

@@ -137,6 +137,7 @@ async def test_the_table_names_every_port_and_a_command_to_try() -> None:
     [
         (["--line", "hut=300"], "1 to 247"),
         (["--line", "hut=1", "--lines", "2"], "exclude each other"),
+        (["--tcp", "65534", "--lines", "3"], "--tcp 65534 leaves no ports for 3 lines"),
         (["--line", "hut=1", "--line", "hut=2"], "repeat"),
         (["--oracle", "--lines", "16"], "no room"),
         (["--link-dir", "/nonexistent"], "does not exist"),
