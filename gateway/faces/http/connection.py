@@ -191,7 +191,7 @@ class Connection(asyncio.Protocol):
         self.aborted = True
         if self._transport is not None:
             sock = self._extra("socket")
-            if sock is not None and (self.busy or self._full):
+            if sock is not None and (self.busy or self._transport.get_write_buffer_size()):
                 with contextlib.suppress(OSError):  # it is gone already
                     cast("socket.socket", sock).setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
             self._transport.abort()

@@ -198,6 +198,13 @@ class Ending(asyncio.Transport):
 
     told = False
 
+    def __init__(self, sock: socket.socket | None = None, left: int = 0) -> None:
+        super().__init__({"socket": sock})
+        self._left = left
+
+    def get_write_buffer_size(self) -> int:
+        return self._left
+
     def abort(self) -> None:
         self.told = True
 
@@ -276,6 +283,20 @@ async def _broken_off(make_gateway: MakeGateway, monkeypatch: pytest.MonkeyPatch
             taken.set()
             with pytest.raises(ConnectionResetError):
                 await reader.read()
+
+
+@pytest.mark.parametrize("left", [0, 5])
+async def test_so_is_one_of_which_the_end_was_not_sent_yet(gateway: Gateway, left: int) -> None:
+    """Its request is over, for the last of the reply fits the buffer; whoever makes room for others loses that."""
+    connections = gateway.face.listeners[0]._connections
+    assert connections is not None
+    with socket.socket() as sock:
+        connection = connections()
+        connection.connection_made(Ending(sock, left))
+        connection.abort()
+        resets = sock.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, 8) == struct.pack("ii", 1, 0)
+    assert resets is bool(left)
+    connection.connection_lost(None)
 
 
 async def test_what_a_client_leaves_in_the_kernel_is_little(gateway: Gateway) -> None:
