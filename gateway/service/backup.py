@@ -24,6 +24,7 @@ import time
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
 
@@ -37,6 +38,7 @@ FORMAT = 1
 MANIFEST = "prostar-gateway-backup.json"
 MOST_BYTES = 16 << 30  # of one file; an archive is input like any other
 TRIES = 20
+LAST_MOMENT = datetime(9999, 1, 1, tzinfo=UTC).timestamp()
 
 _DATABASE = b"SQLite format 3\0"
 _BESIDE = ("-wal", "-shm", "-journal")
@@ -163,7 +165,8 @@ def _unpack(archive: Path, folder: Path) -> Manifest:
     """Every file of an archive, checked; BackupError when anything about it is not as `back_up` makes it."""
     with tarfile.open(archive, "r:") as tar:
         for member in tar:
-            if not member.isreg() or "/" in member.name or member.name.startswith(".") or member.size > MOST_BYTES:
+            odd = "/" in member.name or member.name.startswith(".") or _is_working_copy(member.name)
+            if odd or not member.isreg() or member.size > MOST_BYTES:
                 raise BackupError(f"{archive}: {member.name!r} does not belong into a backup")
             source = tar.extractfile(member)
             assert source is not None, "a regular file"
@@ -176,7 +179,10 @@ def _unpack(archive: Path, folder: Path) -> Manifest:
     except (OSError, ValueError, TypeError) as error:
         raise BackupError(f"{archive}: is no backup of a gateway") from error
     if manifest.format != FORMAT:
-        raise BackupError(f"{archive}: has format {manifest.format}, which this version does not know")
+        raise BackupError(f"{archive}: has format {manifest.format!r}, which this version does not know")
+    at: object = manifest.made_at  # what is in an archive is anything
+    if not isinstance(at, int | float) or not 0 <= at < LAST_MOMENT or not str(manifest.site).isprintable():
+        raise BackupError(f"{archive}: is no backup of a gateway")
     (folder / MANIFEST).unlink()
     for path in _files(folder):
         _check_database(path, archive)

@@ -249,9 +249,16 @@ def test_a_folder_that_cannot_be_made_stops_no_gateway(tmp_path: Path) -> None:
         {MANIFEST: b"{}"},
         {MANIFEST: b"not json"},
         {MANIFEST: b'{"format": 2, "version": "9", "site": "x", "made_at": 0}'},
+        {MANIFEST: b'{"format": 1, "version": "9", "site": "x", "made_at": "yesterday"}'},
+        {MANIFEST: b'{"format": 1, "version": "9", "site": "x", "made_at": 1e300}'},
+        {MANIFEST: b'{"format": 1, "version": "9", "site": "\\u001b[2J", "made_at": 0}'},
         {FILE_NAME: b"SQLite format 3\0" + bytes(5000)},
+        {f"{FILE_NAME}-wal": b"pages of another file"},
     ],
-    ids=["out of the folder", "folder", "hidden", "empty manifest", "no manifest", "later format", "damaged history"],
+    ids=[
+        *("out of the folder", "folder", "hidden", "empty manifest", "no manifest", "later format"),
+        *("no moment", "no year", "a terminal's command", "damaged history", "working copy"),
+    ],
 )
 def test_a_strange_archive_changes_nothing(state: Path, tmp_path: Path, spoil: dict[str, bytes]) -> None:
     archive = tmp_path / "backup.tar"
