@@ -1,6 +1,6 @@
 # Everything a user or a developer does with a clone; `make help` lists it.
 #
-# A fresh Debian 12 with Python 3.11 needs nothing else: the environment in .venv is made from the locked
+# A fresh Debian 12 or 13 with its Python needs nothing else: the environment in .venv is made from the locked
 # requirements (hashes checked) and made again when a lock file changes. Debian packages are installed only
 # where that is allowed (root, or sudo without a password); otherwise the missing ones are named.
 
