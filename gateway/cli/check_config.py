@@ -18,6 +18,7 @@ from gateway.core.budget import LineBudget
 from gateway.service.advice import advice
 from gateway.service.changes import NEEDS_RESTART, changes
 from gateway.service.config import Config
+from gateway.service.http_files import http_problems, unreadable_http
 from gateway.service.settings import line_budgets, line_settings
 from gateway.service.snmp import snmp_on, unreadable
 from gateway.service.tls import tls_problems
@@ -34,7 +35,9 @@ def command(
 ) -> None:
     """Check a configuration: exit status 0 and a projection of its lines, or 78 and every problem."""
     checked = load_or_exit(config)
-    problems = [*tls_problems(checked, SystemClock().wall()), *(unreadable(checked) if quiet else ())]
+    problems = [*tls_problems(checked, SystemClock().wall()), *http_problems(checked)]
+    if quiet:
+        problems += (*unreadable(checked), *unreadable_http(checked))
     if problems:
         refuse(config, [f"{config}: {problem}" for problem in problems])
     if against is not None:

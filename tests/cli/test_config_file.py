@@ -95,6 +95,32 @@ def test_quiet_says_nothing_of_a_file_that_is_right_and_names_secrets_that_canno
     assert run("check-config", "-c", str(config))[0] == 0  # whoever writes a file need not be who may read its secrets
 
 
+@pytest.mark.parametrize(
+    ("key", "content", "complaint"),
+    [
+        ("bearer_token_file", "short", "a token has at least 16 printable ASCII characters and no blanks"),
+        ("basic_auth_file", "# nobody yet", "holds no name:password line"),
+        ("basic_auth_file", "ops", "entry 1 is not name:password"),
+        ("tls_certificate", "no certificate", "no certificate with its key in PEM form"),
+    ],
+)
+def test_what_keeps_the_http_face_closed_is_a_problem(config: Path, key: str, content: str, complaint: str) -> None:
+    """A gateway that runs refuses to be reloaded with it."""
+    file = config.with_name("secret")
+    keys = f'{key} = "{file}"\n' + (f'tls_private_key = "{file}"\n' if key == "tls_certificate" else "")
+    config.write_text(config.read_text().replace(WRONG_ELSEWHERE, "address = 1\n") + f"[http]\n{keys}")
+    assert run("check-config", "-c", str(config))[0] == 0  # whoever writes it need not be who may read its secrets
+    status, _, said = run("check-config", "--quiet", "-c", str(config))
+    assert (status, f"http.{key}: {file} cannot be read: No such file" in said) == (78, True)
+    file.write_text(content)
+    for quiet in ((), ("--quiet",)):
+        status, _, said = run("check-config", *quiet, "-c", str(config))
+        assert status == 78
+        assert f"http.{key}: {file}" in said
+        assert complaint in said
+        assert content not in said.replace(complaint, "")
+
+
 def test_what_a_reload_would_change_is_told_by_key(config: Path) -> None:
     right = config.read_text().replace(WRONG_ELSEWHERE, "address = 1\n")
     config.write_text(right)
