@@ -35,9 +35,11 @@ class Reading:
     def __init__(self, path: Path) -> None:
         """Begin; used by `with`. ReadingFailed when there is no process to be had."""
         self._path = path
-        places = os.pathsep.join(str(Path(place).absolute()) for place in sys.path)
         command = [sys.executable, "-P", "-m", "gateway.service.reading", str(path)]
         try:
+            places = os.pathsep.join(
+                str(Path(place).absolute()) for place in sys.path
+            )  # the folder we are in may be gone
             self._process = subprocess.Popen(  # noqa: S603 - this program itself
                 command,
                 stdin=subprocess.DEVNULL,

@@ -70,6 +70,16 @@ def test_where_it_is_started_makes_no_difference(tmp_path: Path, monkeypatch: py
     assert read_config(CONFIGS / "minimal.toml") == load_config(CONFIGS / "minimal.toml")
 
 
+def test_a_folder_that_is_gone_is_no_verdict(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    monkeypatch.syspath_prepend("")
+    gone.rmdir()
+    with pytest.raises(ReadingFailed, match=r"minimal\.toml: no process can be started to read it: No such file"):
+        read_config(CONFIGS / "minimal.toml")
+
+
 @pytest.mark.parametrize("program", ["/bin/false", "/bin/true", "/nothing/here"])
 def test_a_process_that_does_not_answer_is_no_verdict(monkeypatch: pytest.MonkeyPatch, program: str) -> None:
     monkeypatch.setattr(sys, "executable", program)
