@@ -37,7 +37,7 @@ class Podman:
         (folder / "storage.conf").write_text(
             f'[storage]\ndriver = "overlay"\ngraphroot = "{folder}/storage"\nrunroot = "{folder}/run"\n'
         )
-        keeper = ["unshare", "--mount", "sh", "-c", HIDDEN]
+        keeper = ["setpriv", "--pdeathsig", "KILL", "unshare", "--mount", "sh", "-c", HIDDEN]
         self._keeper = subprocess.Popen(keeper, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         assert self._keeper.stdout is not None
         if not self._keeper.stdout.readline():
