@@ -11,6 +11,7 @@ import pytest
 
 from tests.faults.pty_rig import running
 from tests.faults.rig import read
+from tests.faults.test_f17_replugged import watched
 
 HOLD = """
 import fcntl, os, sys
@@ -31,8 +32,9 @@ sys.stdin.readline()
 
 
 async def test_the_message_names_the_holder_once_and_the_port_is_taken_when_it_is_free(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    looked, _ = watched(monkeypatch)
     link = str(tmp_path / "ttyUSB0")
     holder = await asyncio.create_subprocess_exec(sys.executable, "-c", PORT, link, stdin=asyncio.subprocess.PIPE)
     assert holder.stdin is not None
@@ -43,7 +45,8 @@ async def test_the_message_names_the_holder_once_and_the_port_is_taken_when_it_i
             assert f"process {holder.pid}" in error
             assert "python" in error
             assert link in error
-            await asyncio.sleep(0.5)  # some more tries
+            tried = len(looked)
+            await line.until(lambda: len(looked) >= tried + 2)
             complaints = [message for message in caplog.messages if "in use by" in message]
             assert len(complaints) == 1
             holder.stdin.write(b"let go\n")

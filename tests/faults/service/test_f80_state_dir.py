@@ -55,8 +55,8 @@ async def test_data_are_served_and_everybody_is_told(service: Service, peer: Cal
         while not RAISED.search((await service.get("/metrics"))[1]):  # noqa: ASYNC110 - the process has no event for it
             await asyncio.sleep(0.1)
     assert "prostar_gateway_history_store_up 0.0" in (await service.get("/metrics"))[1]
+    assert await service.end() == 0
     log = program.log()
     for event in ("history_store_failed", "snmp_engine_new", "state_dir_unusable", "trace_off"):
         assert log.count(f"event={event}") == (0 if event == "trace_off" and kind == "full" else 1), event
     assert "Traceback" not in log
-    assert await service.end() == 0
