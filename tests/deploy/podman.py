@@ -82,8 +82,11 @@ class Podman:
             if made.returncode != 0:
                 pytest.skip(f"neither a registry nor debootstrap gives a base image here: {made.stderr[-500:]}")
             away = " ".join(f"--exclude=./{path}/*" for path in SLIM)
-            self.sh(f"tar -C {root} {away} -c . | podman import --change CMD=bash - {BASE}", self._folder)
+            packed = f"tar -C {root} {away} -c . | podman import --change CMD=bash - {BASE}"
+            kept = self.sh(packed, self._folder, check=False)
             self.sh(f"rm -rf {root}", self._folder)
+            if kept.returncode != 0:
+                pytest.skip(f"podman cannot keep images here: {kept.stderr[-500:]}")
         tried = self.sh(f"podman run --rm --network host {BASE} true", self._folder, check=False)
         if tried.returncode != 0:
             pytest.skip(f"containers cannot be run here: {tried.stderr.strip()}")
