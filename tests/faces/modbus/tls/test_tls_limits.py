@@ -86,7 +86,7 @@ async def test_records_end_where_they_like_and_share_segments(serve_tls: ServeTl
 
 
 async def test_a_handshake_that_does_not_come_ends_and_delays_nobody(serve_tls: ServeTls) -> None:
-    site = await serve_tls(tls={"handshake_timeout_s": 0.3})
+    site = await serve_tls(tls={"handshake_timeout_s": 1.0})
     silent = await site.running.connect()
     slow = await Hand.of(site)
     with pytest.raises(ssl.SSLWantReadError):
