@@ -6,6 +6,8 @@ Rule 2: the port is looked at when bytes are due, not at each byte: the reader s
         whole, a little early. A reply of 170 bytes costs a few wake-ups.
 Rule 3: whatever goes wrong is told once, as the line's failure; after that nothing is read any more, for a dead
         descriptor is readable for ever.
+Rule 4: nothing is sent late. A port that has not taken a frame when the next one is due has failed: what it was given
+        ended long ago for who asked, and a write among it must not reach a controller then.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ SHORTEST_PAUSE_S = 0.002
 """A shorter sleep costs more than the wake-ups it saves."""
 THREAD_READ_S = 0.1
 WAITING_FRAMES = 4
+TAKES_NO_MORE = "the other end takes no more requests"
 
 
 class Owner(Protocol):
@@ -112,10 +115,13 @@ class FileTransport:
         self._loop.remove_writer(self._fd)
 
     def write(self, frame: bytes) -> None:
-        """Send a frame; what the kernel does not take now follows as soon as it does."""
+        """Send a frame; what the kernel does not take now follows as soon as it does, until the next frame (rule 4)."""
         if self._ended:
             return
-        self._rest += frame
+        if self._rest:
+            self._fail(TAKES_NO_MORE)
+            return
+        self._rest = frame
         self._writable()
         self._got = self._total = 0
         self._sleep_until(self._loop.time() + (len(frame) + self._owner.bytes_due()) * self._char_s)
@@ -217,7 +223,7 @@ class ThreadTransport:
         try:
             self._frames.put_nowait(frame)
         except queue.Full:
-            self._fail("the other end takes no more requests")
+            self._fail(TAKES_NO_MORE)
 
     def take(self) -> bytes:
         """See `Transport.take`; this reader never sleeps."""

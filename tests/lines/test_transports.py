@@ -130,6 +130,28 @@ async def test_a_write_that_the_kernel_takes_in_parts_loses_nothing_and_does_not
     assert owner.failures == []
 
 
+async def test_what_was_not_taken_is_not_sent_when_the_next_frame_is_due(
+    owner: Owner, ends: tuple[socket.socket, socket.socket]
+) -> None:
+    near, far = ends
+    near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)
+    transport = FileTransport(near.fileno(), asyncio.get_running_loop(), owner, CHAR_S)
+    transport.start()
+    transport.write(b"old" * 100_000)
+    transport.write(b"new")
+    assert owner.failures == ["the other end takes no more requests"]
+    transport.write(b"newer")
+    got = b""
+    far.setblocking(False)
+    for _ in range(10):
+        await asyncio.sleep(0)
+        with contextlib.suppress(BlockingIOError):
+            got += far.recv(1 << 20)
+    assert 0 < len(got) < 300_000
+    assert b"new" not in got
+    assert owner.failures == ["the other end takes no more requests"]
+
+
 @pytest.mark.parametrize("asleep", [False, True])
 async def test_a_device_that_goes_is_told_once_and_within_a_second(owner: Owner, asleep: bool) -> None:  # F16
     master, slave = pty.openpty()
