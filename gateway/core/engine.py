@@ -15,7 +15,8 @@ Rule 7: after a missed reply its device answers a small question of another kind
 Rule 8: a client's read that the device is too busy for (exception 06) is made once more, if there are retries at
         all; every other exception, and a second 06, is the answer.
 Rule 9: a line that stops (`finish`) lets what is under way run to its end, begins nothing more, and ends all else
-        that waits or comes with 06. A write that was sent never ends so: 06 says that nothing was done.
+        that waits or comes with 06. A write that was sent never ends so, nor with 0A when its line is closed: that
+        would say that nothing was done.
 Rule 10: a request that ended through no fault of its own (an upstream's connection was lost, or others were under way
         with it) is made once more, with the line to itself. Nobody counts it against the device. A write is not.
 Rule 11: what a gateway says in the place of a device (exceptions 0A and 0B of an upstream) is the answer to clients,
@@ -62,6 +63,7 @@ from gateway.errors import (
     ReplyTimeout,
     RequestError,
     ShuttingDown,
+    Unconfirmed,
 )
 from gateway.modbus.collector import Echo
 from gateway.modbus.pdu import EXCEPTION_BIT, Function, is_exception
@@ -156,7 +158,7 @@ class LineEngine:
         for turn, sent_at in self._under_way.clear():
             self._records[turn.device.unit_id].doubt.missed(turn.pdu[0])
             self._accounting.ended(turn, sent_at, now, "line_down")
-            self._finish(waiters_of(turn), LineDown(error) if isinstance(turn, WriteTurn) else reason)
+            self._finish(waiters_of(turn), Unconfirmed(error) if isinstance(turn, WriteTurn) else reason)
         for turn in self._aside.clear():
             self._finish(waiters_of(turn), reason)
         self._finish(self._scheduler.drain(), reason)

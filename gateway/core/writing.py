@@ -7,7 +7,7 @@ Rule 2: the intent of every part stands in the ledger, on the disk, before the f
 Rule 3: the parts go out one by one in order, each once (F43). The first that fails ends the request with its exception;
         the parts after it are not sent. The ledger says of each what became of it.
 Rule 4: a part that wears is read back. Another value is exception 04 and "differs". Where that cannot be now, nobody
-        knows (rule 5), and the exception is not 06, which says that nothing was done.
+        knows (rule 5), and the exception is neither 06 nor 0A, which say that nothing was done.
 Rule 5: when no answer came, nobody knows ("unknown"), until the register was read back (`settle`). A line that closed
         may have been closed under way, so it is "unknown" too.
 Rule 6: what a controller needs again and again (slave control) goes out at once: not compared, not read back, not held
@@ -33,6 +33,7 @@ from gateway.errors import (
     IdentityUnproven,
     IllegalFunction,
     LineDown,
+    PathUnavailable,
     ReplyMismatch,
     RequestError,
     Unconfirmed,
@@ -199,7 +200,7 @@ class _Performance:
                 found = _words(moment.outcome, 1)[0]
             except _Refusal as refusal:
                 fate, outcome = Fate.UNKNOWN, refusal.outcome
-                if _code(outcome) == Busy.exception_code:
+                if _code(outcome) in {Busy.exception_code, PathUnavailable.exception_code}:
                     outcome = Unconfirmed(part.point.name)
             else:
                 if found != part.write.value:

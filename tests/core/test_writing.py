@@ -269,8 +269,12 @@ def test_a_write_that_cannot_be_read_back_is_unknown(bench: Bench) -> None:
     assert bench.fates() == [Fate.UNKNOWN]
 
 
-@pytest.mark.parametrize("why", [QueueFull("array-1"), ShuttingDown(), b"\x83\x06"], ids=["full", "stopping", "busy"])
-def test_a_write_that_cannot_be_read_back_for_now_is_0b_and_never_06(bench: Bench, why: Outcome) -> None:
+@pytest.mark.parametrize(
+    "why",
+    [QueueFull("array-1"), ShuttingDown(), LineDown("unplugged"), b"\x83\x06"],
+    ids=["full", "stopping", "closed", "busy"],
+)
+def test_a_write_that_cannot_be_read_back_for_now_is_0b_and_not_06_or_0a(bench: Bench, why: Outcome) -> None:
     bench.faults[2] = why
     result = bench.write("06 E000 4B64")
     assert isinstance(result.outcome, Unconfirmed)

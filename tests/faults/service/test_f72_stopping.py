@@ -106,7 +106,7 @@ async def test_a_write_that_is_given_up_was_sent_and_is_not_said_not_to_be(servi
         assert await asker.reply() == b"\x86\x0b"
         assert await other.reply() == b"\x86\x06"
     assert await service.ended() == 0
-    assert what_became_of_the_write(service) == (Fate.UNKNOWN, 0x0A)
+    assert what_became_of_the_write(service) == (Fate.UNKNOWN, 0x0B)
     assert unit.asked.count(WRITE) == 1
 
 
