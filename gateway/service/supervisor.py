@@ -194,7 +194,8 @@ class Supervisor:
             await asyncio.Event().wait()
         finally:
             self._up.discard(listener)
-            await listener.stop()
+            # In a task of its own: in one that was cancelled, asyncio.timeout of Python 3.11.2 takes its end for that.
+            await asyncio.create_task(listener.stop(), name=f"{listener.label} stops")
 
     def _was_tried(self, listener: Listener) -> None:
         self._tried.add(listener)

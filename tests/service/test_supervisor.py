@@ -287,6 +287,23 @@ async def test_what_does_not_stop_is_left_behind(
     await asyncio.sleep(0)
 
 
+async def test_a_listener_stops_in_a_task_that_nobody_cancelled() -> None:
+    """In one that was, asyncio.timeout of Python 3.11.2 never ends in time: nobody was told that it is over."""
+    cancelled: list[int] = []
+
+    class Asking(FakeListener):
+        async def stop(self) -> None:
+            task = asyncio.current_task()
+            assert task is not None
+            cancelled.append(task.cancelling())
+
+    listener = Asking("x")
+    async with running(Supervisor(Time(), [], [listener])):
+        await listener.started.wait()
+        await asyncio.sleep(0)
+    assert cancelled == [0]
+
+
 async def test_a_stop_that_fails_is_logged_and_nothing_else(caplog: pytest.LogCaptureFixture) -> None:
     def fail() -> None:
         raise ZeroDivisionError
