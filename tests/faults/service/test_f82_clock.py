@@ -9,6 +9,7 @@ import asyncio
 import re
 import signal
 import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -16,12 +17,19 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.programs import environment
+from tests.e2e.programs import Program, environment
 from tests.faults.service.rig import Service, Unit, client, until
 from tests.faults.service.test_f78_reload import LINE_KEYS, reading, user
 
 LIBRARY = "libfaketimeMT.so.1"
 START, DAY_S = -20_000 * 86_400, 86_400
+GATEWAY = """
+import select, time
+time.sleep = lambda seconds: select.select([], [], [], seconds)
+from gateway.cli.main import main
+main()
+"""
+"""The gateway where the library is: clock_nanosleep, which Python sleeps by, refuses moments in it."""
 STEPS = (0, 3_600, 0, 365 * DAY_S, 0)
 """What the clock is set to, in seconds from now: from 1972 to now, by an hour and a year forth and back."""
 
@@ -112,7 +120,8 @@ async def test_nobody_notices(
     table, noc = user("noc", service.folder, "correct-horse-1")
     service.configure((("shelter-a", "array-1", 1, 11),), f"[poll]\nlive_s = 0.2\n{table}", LINE_KEYS)
     started_at = time.time()
-    program = service.start(**faked(START))
+    program = Program([sys.executable, "-c", GATEWAY, "run", "-c", str(service.config)], **faked(START))
+    service.programs.append(program)
     await service.online()
     await is_set(service, started_at + START)
     unit = service.units["shelter-a"][0]
