@@ -32,7 +32,7 @@ from gateway.history.harvest import Harvest
 from gateway.history.harvest import Outcome as Ending
 from gateway.history.identity import Place, Seen
 from gateway.history.schedule import DAY_HOURS, Schedule, Who
-from gateway.history.session import Session, awake_s
+from gateway.history.session import Session, ahead_s
 from gateway.history.settings import HistorySettings
 from gateway.history.store import Kept, Plan, Store
 
@@ -89,19 +89,14 @@ class HistoryKeeper:
         *,
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
         executor: Callable[[], Executor] = one_thread,
-        awake_s: Callable[[], float] = awake_s,
         session: Session | None = None,
     ) -> None:
-        """`awake_s` is a clock that never steps and does not stop while the machine sleeps.
-
-        `session` is that of the keeper before; left out: this one is the first.
-        """
+        """`session` is that of the keeper before; left out: this one is the first."""
         self._settings = settings
         self._clock = clock
         self._stats = stats
         self._sleep = sleep
-        self._awake_s = awake_s
-        self._session = Session.begin(clock, awake_s) if session is None else session
+        self._session = Session.begin(clock) if session is None else session
         self._store = AsyncStore(settings.directory, clock, stats, executor, session=self._session.number)
         self._budget = LogBudget(window_s=3600.0)
         self._lines: list[list[_Watch]] = []
@@ -333,7 +328,7 @@ class HistoryKeeper:
         """Rule 4; of several lines that see the same step the first one moves the dates."""
         session = self._session
         async with session.minding:
-            offset, before = self._clock.wall() - self._awake_s(), session.clock_offset
+            offset, before = ahead_s(self._clock), session.clock_offset
             step_s = offset - before
             if abs(step_s) < CLOCK_STEP_S:
                 return

@@ -8,22 +8,19 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from gateway.clock import Clock
 
 
-def awake_s() -> float:
-    """Seconds from an arbitrary start, the machine's sleep included where the system can tell."""
-    boot = getattr(time, "CLOCK_BOOTTIME", None)
-    return time.monotonic() if boot is None else time.clock_gettime(boot)
+def ahead_s(clock: Clock) -> float:
+    """How far the wall clock is ahead of the time that never steps: another figure means that it was set."""
+    return clock.wall() - clock.monotonic()
 
 
 @dataclass(slots=True)
 class Session:
-    """What keepers hand on: `clock_offset` is how far the clock was ahead of `awake_s` when dates were last right."""
+    """What keepers hand on: `clock_offset` is what `ahead_s` was when dates were last right."""
 
     clock_offset: float
     controllers: set[int] = field(default_factory=set)  # the keys of those that it looked at
@@ -31,6 +28,6 @@ class Session:
     minding: asyncio.Lock = field(default_factory=asyncio.Lock)  # held by who moves dates
 
     @classmethod
-    def begin(cls, clock: Clock, awake_s: Callable[[], float] = awake_s) -> Session:
+    def begin(cls, clock: Clock) -> Session:
         """The run that begins now."""
-        return cls(clock.wall() - awake_s())
+        return cls(ahead_s(clock))

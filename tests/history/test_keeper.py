@@ -386,7 +386,7 @@ async def test_what_the_keeper_before_dated_is_moved_too(
     tmp_path: Path, gateway: Gateways, clock: VirtualClock
 ) -> None:
     """A reload, or a model that was found, begins another keeper in the same run of the gateway."""
-    controller, session = unit(seed=0), Session.begin(clock, clock.monotonic)
+    controller, session = unit(seed=0), Session.begin(clock)
     async with gateway(controller, session=session) as running:
         await running.until(lambda: running.stats.devices[11].harvests)
     before = rows(tmp_path, "SELECT hourmeter, written_wall FROM day")
@@ -405,13 +405,10 @@ async def test_the_sleep_of_the_machine_is_no_step_of_the_clock(
     tmp_path: Path, gateway: Gateways, clock: VirtualClock
 ) -> None:
     running = gateway(unit(seed=0))
-    slept = 0.0
-    running.keeper._awake_s = lambda: clock.now + slept
     async with running:
         await running.until(lambda: running.stats.devices[11].harvests)
         before = rows(tmp_path, "SELECT hourmeter, written_wall FROM day")
-        slept = 7200.0
-        clock.wall_offset += slept
+        clock.now += 7200.0  # both clocks went on (tests/test_clock.py)
         await running.run(20.0)
         assert rows(tmp_path, "SELECT hourmeter, written_wall FROM day") == before
 

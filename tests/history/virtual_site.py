@@ -127,7 +127,6 @@ class VirtualGateway:
             self.stats,
             sleep=self._sleep,
             executor=InlineExecutor,
-            awake_s=clock.monotonic,
             session=session,
         )
         self._task: asyncio.Task[None] | None = None
