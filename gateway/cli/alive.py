@@ -11,15 +11,14 @@ from __future__ import annotations
 
 import ssl
 import sys
-import tomllib
-from collections.abc import Mapping, Sequence
-from http.client import HTTPConnection, HTTPException, HTTPSConnection
+from collections.abc import Sequence
+from http.client import HTTPException
 from pathlib import Path
-from typing import Any
 
-from gateway.service.parsing import HTTP_LISTEN, Address, parse_listen
-
-TIMEOUT_S = 5.0
+from gateway.cli.asking import ask
+from gateway.errors import ConfigError
+from gateway.service.parsing import HTTP_LISTEN, parse_listen
+from gateway.service.toml_file import read_toml
 
 
 def plain_arguments(words: Sequence[str]) -> Path | None:
@@ -33,18 +32,18 @@ def plain_arguments(words: Sequence[str]) -> Path | None:
 def health(path: Path) -> int:
     """Ask the gateway that runs by the configuration in the file: 0 when it answers, otherwise 1, and one line why."""
     try:
-        http = tomllib.loads(path.read_bytes().decode()).get("http", {})
+        http = read_toml(path).get("http", {})
         listen = http.get("listen", [HTTP_LISTEN])
         address = parse_listen(listen[0]) if listen else None
-    except OSError as error:
-        return _ill(f"{path}: cannot be read: {error.strerror or error}")
+    except ConfigError as error:
+        return _ill("\n".join(error.problems))
     except (ValueError, AttributeError, TypeError, LookupError):
         return _ill(f"{path}: does not say where the HTTP face is: see check-config")
     if address is None:
         return _ill(f"{path}: http.listen is empty, so the gateway cannot be asked")
     where = f"http{'s' if http.get('tls_certificate') else ''}://{address}/healthz"
     try:
-        status = _asked(address, http)
+        status = ask(address, "/healthz", _anybody() if http.get("tls_certificate") else None, {}).status
     except (OSError, HTTPException) as error:
         return _ill(f"{where}: {getattr(error, 'strerror', None) or error}")
     if status != 200:
@@ -53,24 +52,12 @@ def health(path: Path) -> int:
     return 0
 
 
-def _asked(address: Address, http: Mapping[str, Any]) -> int:
-    """The status that `/healthz` answers with; OSError or HTTPException where there is none."""
-    if http.get("tls_certificate"):
-        context = ssl.create_default_context()
-        context.check_hostname = False
-        context.verify_mode = ssl.CERT_NONE  # rule 3
-        connection: HTTPConnection = HTTPSConnection(
-            address.reached_at, address.port, timeout=TIMEOUT_S, context=context
-        )
-    else:
-        connection = HTTPConnection(address.reached_at, address.port, timeout=TIMEOUT_S)
-    try:
-        connection.request("GET", "/healthz", headers={"Connection": "close"})
-        reply = connection.getresponse()
-        reply.read()
-    finally:
-        connection.close()
-    return reply.status
+def _anybody() -> ssl.SSLContext:
+    """Rule 3."""
+    context = ssl.create_default_context()
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    return context
 
 
 def _ill(why: str) -> int:

@@ -11,7 +11,7 @@ import json
 import ssl
 import sys
 from collections.abc import Mapping, Sequence
-from http.client import HTTPConnection, HTTPException, HTTPSConnection
+from http.client import HTTPException
 from typing import Annotated, Any
 
 import typer
@@ -20,14 +20,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from gateway.cli.asking import ask
 from gateway.cli.config_file import ConfigOption, part_or_exit
 from gateway.errors import ListenError
 from gateway.faces.http.access import read_passwords, read_token
 from gateway.faces.http.clients import PATH
 from gateway.service.parsing import parse_listen
 from gateway.service.schema import HttpTable
-
-TIMEOUT_S = 5.0
 
 
 class _Unreachable(Exception):
@@ -57,30 +56,27 @@ def command(
 def _ask(http: HttpTable) -> Mapping[str, Any]:
     address = parse_listen(http.listen[0])
     where = f"http{'s' if http.tls_certificate else ''}://{address}{PATH}"
-    host = address.reached_at
     try:
-        if http.tls_certificate:
-            context = ssl.create_default_context(cafile=http.tls_certificate)
-            context.check_hostname = False  # it must be this very certificate, whatever name is in it
-            # … and whoever issued it: the file has no root when a public authority did.
-            context.verify_flags = ssl.VERIFY_X509_PARTIAL_CHAIN
-            connection: HTTPConnection = HTTPSConnection(host, address.port, timeout=TIMEOUT_S, context=context)
-        else:
-            connection = HTTPConnection(host, address.port, timeout=TIMEOUT_S)
-        try:
-            connection.request("GET", PATH, headers=_credentials(http))
-            reply = connection.getresponse()
-            body = reply.read()
-        finally:
-            connection.close()
-        if reply.status != 200:
-            raise _Unreachable(f"{where}: {reply.status} {reply.reason}")
-        document: Mapping[str, Any] = json.loads(body)
+        answer = ask(address, PATH, _tls(http), _credentials(http))
+        if answer.status != 200:
+            raise _Unreachable(f"{where}: {answer.status} {answer.reason}")
+        document: Mapping[str, Any] = json.loads(answer.body)
     except (OSError, HTTPException, ValueError) as error:
         raise _Unreachable(f"{where}: {getattr(error, 'strerror', None) or error}; is the gateway running?") from None
     except ListenError as error:
         raise _Unreachable(str(error)) from None
     return document
+
+
+def _tls(http: HttpTable) -> ssl.SSLContext | None:
+    """What takes this very certificate, whatever name is in it."""
+    if not http.tls_certificate:
+        return None
+    context = ssl.create_default_context(cafile=http.tls_certificate)
+    context.check_hostname = False
+    # … and whoever issued it: the file has no root when a public authority did.
+    context.verify_flags = ssl.VERIFY_X509_PARTIAL_CHAIN
+    return context
 
 
 def _credentials(http: HttpTable) -> dict[str, str]:

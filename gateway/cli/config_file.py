@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -12,7 +11,8 @@ import typer
 
 from gateway.cli.refusing import counted, refused
 from gateway.errors import ConfigError
-from gateway.service.config import Config, config_of, file_text, load_config
+from gateway.service.config import Config, config_of, load_config
+from gateway.service.toml_file import read_toml
 
 ConfigOption = Annotated[Path, typer.Option("--config", "-c", metavar="FILE", help="The configuration file (TOML).")]
 
@@ -45,9 +45,9 @@ def part_or_exit(path: Path, *keys: str) -> Config:
     except ConfigError as error:
         problems = error.problems
     try:
-        raw = tomllib.loads(file_text(path))
+        raw = read_toml(path)
         part = config_of({**_STAND_IN, **{key: raw[key] for key in keys if key in raw}})
-    except (ValueError, RecursionError, ConfigError):
+    except ConfigError:
         refuse(path, problems)
     if not raw.keys() <= Config.model_fields.keys():
         refuse(path, problems)

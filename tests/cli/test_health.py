@@ -12,7 +12,7 @@ from threading import Thread
 import pytest
 from typer.testing import CliRunner
 
-from gateway.cli import alive
+from gateway.cli import alive, asking
 from gateway.cli.app import app
 from gateway.service.parsing import HTTP_LISTEN
 from gateway.service.schema import HttpTable
@@ -56,6 +56,11 @@ def test_a_configuration_that_waits_for_its_reload_makes_nobody_ill(
     assert said(capsys, running.config)[0] == 0
 
 
+def test_a_file_as_windows_editors_write_it_is_read(running: Running, capsys: pytest.CaptureFixture[str]) -> None:
+    running.config.write_text(f"\ufeff{running.config.read_text()}", newline="\r\n")
+    assert said(capsys, running.config)[0] == 0
+
+
 def test_both_ways_to_call_it_say_the_same(running: Running) -> None:
     call = [sys.executable, "-m", "gateway", "health"]
     for options in (["-c", str(running.config)], ["--config", str(running.config)], [f"--config={running.config}"]):
@@ -76,7 +81,7 @@ def test_nobody_there(running: Running, capsys: pytest.CaptureFixture[str], tmp_
 def test_one_that_hangs_is_given_up(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(alive, "TIMEOUT_S", 0.05)
+    monkeypatch.setattr(asking, "TIMEOUT_S", 0.05)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         path = tmp_path / "site.toml"
         path.write_text(f'[http]\nlisten = ["0.0.0.0:{silent.getsockname()[1]}"]')
@@ -110,7 +115,7 @@ def test_another_answer_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[st
     ("text", "reason"),
     [
         ("[http]\nlisten = []", "http.listen is empty, so the gateway cannot be asked"),
-        ("[http", "does not say where the HTTP face is: see check-config"),
+        ("[http", "not TOML: Expected ']' at the end of a table declaration (at end of document)"),
         ("http = 5", "does not say where the HTTP face is: see check-config"),
         ("[http]\nlisten = 9850", "does not say where the HTTP face is: see check-config"),
         ('[http]\nlisten = "127.0.0.1:9850"', "does not say where the HTTP face is: see check-config"),
@@ -127,6 +132,14 @@ def test_a_file_that_names_no_address_is_said(
     if text is not None:
         path.write_text(text)
     assert said(capsys, path) == (1, f"{path}: {reason}\n")
+
+
+def test_a_file_that_is_too_deep_to_be_read_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "site.toml"
+    path.write_text(f"x = {'[' * 5000}")
+    status, text = said(capsys, path)
+    assert status == 1
+    assert text.startswith(f"{path}: not TOML that can be read: ")
 
 
 def test_it_asks_by_default_where_the_gateway_is_by_default() -> None:
