@@ -9,13 +9,13 @@ import ipaddress
 import os
 import re
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gateway.clock import SystemClock
 from gateway.core.budget import LineBudget
 from gateway.devices.schema import models
 from gateway.devices.unknown import AUTO
+from gateway.service.http_files import unreadable_http
 from gateway.service.notify import notify_advice
 from gateway.service.parsing import DOCUMENTATION_ROOT, parse_listen, parse_root
 from gateway.service.secret_files import open_to_all
@@ -144,17 +144,9 @@ def _http(config: Config) -> Iterator[str]:
             yield f"{path}: {text} can be reached from other machines, and without TLS the secret is sent in clear"
     for key, name in {**secrets, "tls_private_key": http.tls_private_key}.items():
         if name:
-            yield from _readable(f"http.{key}", Path(name))
             yield from open_to_all(f"http.{key}", name)
-    if http.tls_certificate:
-        yield from _readable("http.tls_certificate", Path(http.tls_certificate))
-
-
-def _readable(key: str, path: Path) -> Iterator[str]:
-    try:
-        path.read_bytes()
-    except OSError as error:
-        yield f"{key}: {path} cannot be read ({error.strerror}); the HTTP face stays closed until it can"
+    for problem in unreadable_http(config):
+        yield f"{problem}; the HTTP face stays closed until it can"
 
 
 def _beyond_loopback(listens: Sequence[str]) -> list[tuple[int, str]]:

@@ -118,7 +118,7 @@ def test_secret_files_are_looked_at(tmp_path: Path) -> None:
     [clear, unreadable] = advised(text)
     assert clear.endswith("without TLS the secret is sent in clear")
     assert unreadable == (
-        f"http.bearer_token_file: {token} cannot be read (No such file or directory); the HTTP face stays closed "
+        f"http.bearer_token_file: {token} cannot be read: No such file or directory; the HTTP face stays closed "
         "until it can"
     )
     token.write_text("a-token-of-more-than-16")
@@ -135,4 +135,4 @@ def test_a_secret_file_that_cannot_even_be_looked_at_is_named(tmp_path: Path) ->
     text += f'community_file = "{token}"\n'
     [community, unreadable] = advised(text)
     assert community.endswith("cannot be read: File name too long; the gateway will not start without it")
-    assert unreadable.endswith("cannot be read (File name too long); the HTTP face stays closed until it can")
+    assert unreadable.endswith("cannot be read: File name too long; the HTTP face stays closed until it can")
