@@ -37,9 +37,8 @@ class Reading:
         self._path = path
         command = [sys.executable, "-P", "-m", "gateway.service.reading", str(path)]
         try:
-            places = os.pathsep.join(
-                str(Path(place).absolute()) for place in sys.path
-            )  # the folder we are in may be gone
+            # Within the `try`: the folder that we are in may be gone.
+            places = os.pathsep.join(str(Path(place).absolute()) for place in sys.path)
             self._process = subprocess.Popen(  # noqa: S603 - this program itself
                 command,
                 stdin=subprocess.DEVNULL,
