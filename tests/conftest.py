@@ -15,6 +15,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from tests.cable import Cable
+from tests.machine import Bystander
 from tests.ports import free_port
 
 # Deadlines measure the machine, not the code. CI replays the same examples on every run, so that a red
@@ -55,6 +56,14 @@ def cable(peer: Callable[[str], str]) -> Iterator[Cable]:
         pytest.skip(f"network namespaces are not permitted here: {error.stderr.strip()}")
     yield made
     made.remove()
+
+
+@pytest.fixture
+def passing() -> Iterator[Bystander]:
+    """What tells how long other processes take, once it is started."""
+    bystander = Bystander()
+    yield bystander
+    bystander.stop()
 
 
 @pytest.fixture

@@ -91,10 +91,10 @@ def served() -> Iterator[int]:
 def test_idle_connections_cost_no_threads(served: int) -> None:
     before = threading.active_count()
     with contextlib.ExitStack() as stack:
-        idle = [stack.enter_context(socket.create_connection(("127.0.0.1", served), timeout=5)) for _ in range(IDLE)]
+        idle = [stack.enter_context(socket.create_connection(("127.0.0.1", served), timeout=60)) for _ in range(IDLE)]
         for one in idle:
             one.sendall(b"GET /metrics HT")
-        last = stack.enter_context(socket.create_connection(("127.0.0.1", served), timeout=5))
+        last = stack.enter_context(socket.create_connection(("127.0.0.1", served), timeout=60))
         last.sendall(b"GET /metrics HTTP/1.0\r\n\r\n")
         assert last.recv(100).startswith(b"HTTP/1.")  # so the others were accepted before
         assert threading.active_count() - before < IDLE

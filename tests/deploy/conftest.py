@@ -37,7 +37,7 @@ class Server:
         """The data of a query of its API; AssertionError with what it says when it refuses."""
         query = urllib.parse.urlencode(parameters)
         try:
-            with urllib.request.urlopen(f"{self.url}/api/v1/{path}?{query}", timeout=10) as reply:
+            with urllib.request.urlopen(f"{self.url}/api/v1/{path}?{query}", timeout=60) as reply:
                 return json.load(reply)["data"]
         except urllib.error.HTTPError as error:
             with error:
@@ -62,7 +62,7 @@ def _answers(url: str) -> bool:
 
 def read_past_the_polls(port: int) -> None:
     """A Modbus client's read of the daily log, which only the line can answer."""
-    with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
+    with socket.create_connection(("127.0.0.1", port), timeout=60) as client:
         client.sendall(struct.pack(">HHHBBHH", 1, 0, 6, 11, 3, 0x8000, 16))
         assert len(client.recv(300)) == 9 + 32
 
@@ -112,7 +112,7 @@ def server(peer: Callable[[str], str], tmp_path_factory: pytest.TempPathFactory)
                 yield found
             finally:
                 process.terminate()
-                process.wait(20)
+                process.wait(60)
         finally:
             for each in reversed(started):
                 each.end()

@@ -112,7 +112,7 @@ def test_the_image_is_built_and_runs_as_the_page_says(podman: Podman, line: Path
         return done.stdout + done.stderr
 
     def asked(path: str) -> str:
-        with urllib.request.urlopen(f"http://127.0.0.1:{http}{path}", timeout=10) as reply:
+        with urllib.request.urlopen(f"http://127.0.0.1:{http}{path}", timeout=60) as reply:
             return str(reply.read().decode())
 
     def log() -> str:

@@ -77,7 +77,7 @@ def test_every_face_shows_what_was_found(site: Running, peer: Callable[[str], st
 
 def test_a_connection_outlives_the_finding_and_the_stranger_is_served_raw(site: Running) -> None:
     stranger = OracleController(load_map("prostar-mppt"), device=9, address=3)
-    with ModbusTcpClient("127.0.0.1", port=site.modbus, timeout=5, retries=0) as client:
+    with ModbusTcpClient("127.0.0.1", port=site.modbus, timeout=60, retries=0) as client:
         for first, count in ((0x0000, 82), (0x8000, 112), (0xE000, 80)):
             reply = client.read_holding_registers(first, count=count, device_id=15)
             assert reply.registers == [stranger.word(address) for address in range(first, first + count)]
@@ -108,7 +108,7 @@ def test_what_was_found_can_be_written_where_a_rule_allows_it(launch: Launch, st
     wait_until(lambda: len(models(site)) == 4, "the models in /metrics")
     settings = r'morningstar_absorption_voltage_volts\{device="array-4",.*\} ([\d.]+)'
     wait_until(lambda: re.search(settings, site.get("/metrics")[1]), "the settings of the TriStar")
-    with ModbusTcpClient("127.0.0.1", port=site.modbus, timeout=10, retries=0) as client:
+    with ModbusTcpClient("127.0.0.1", port=site.modbus, timeout=60, retries=0) as client:
         scaling = client.read_holding_registers(0x0000, count=2, device_id=14).registers
         word = round(56.0 * 32768 / (scaling[0] + scaling[1] / 65536))
         assert not client.write_register(0xE000, word, device_id=14).isError()

@@ -82,7 +82,7 @@ def snmp(peer: Callable[[str], str], site: Running, program: str, *arguments: st
 def by_modbus(site: Running) -> Values:
     """Every point as an unrelated Modbus client reads it."""
     found: dict[tuple[int, str], Value] = {}
-    with ModbusTcpClient("127.0.0.1", port=site.modbus, timeout=5, retries=0) as client:
+    with ModbusTcpClient("127.0.0.1", port=site.modbus, timeout=60, retries=0) as client:
         for unit, device_map in MAPS.items():
             cells = cells_of(client, unit, device_map)
             scaling = {
@@ -344,7 +344,7 @@ def test_promtool_and_a_real_prometheus_have_nothing_to_complain_about(
 
     def query(text: str) -> list[Mapping[str, object]]:
         try:
-            with urllib.request.urlopen(f"http://{web}/api/v1/query?query={text}", timeout=5) as reply:
+            with urllib.request.urlopen(f"http://{web}/api/v1/query?query={text}", timeout=60) as reply:
                 answer = json.load(reply)
         except urllib.error.HTTPError as error:
             error.close()

@@ -97,7 +97,7 @@ def test_mbpoll_reads_what_each_controller_holds(fast_site: Running, peer: Calla
 
 def test_pymodbus_reads_what_each_controller_holds(fast_site: Running) -> None:
     read = 0
-    with ModbusTcpClient("127.0.0.1", port=fast_site.modbus, timeout=5, retries=0) as client:
+    with ModbusTcpClient("127.0.0.1", port=fast_site.modbus, timeout=60, retries=0) as client:
         for unit, oracle in by_unit().items():
             for extent in oracle.map.extents:
                 if extent.space is Space.COILS:
@@ -120,7 +120,7 @@ def test_pymodbus_reads_what_each_controller_holds(fast_site: Running) -> None:
 
 
 def test_nobody_can_write(fast_site: Running) -> None:
-    with ModbusTcpClient("127.0.0.1", port=fast_site.modbus, timeout=5, retries=0) as client:
+    with ModbusTcpClient("127.0.0.1", port=fast_site.modbus, timeout=60, retries=0) as client:
         for reply in (
             client.write_register(0xE000, 1, device_id=11),
             client.write_coil(0x00FF, value=True, device_id=11),

@@ -54,7 +54,7 @@ class Site:
         """A client of pymodbus' own that shows this certificate."""
         context = self._pki.client(certificate)
         context.check_hostname = False  # pymodbus' synchronous client does not say whom it wants
-        client = ModbusTlsClient("localhost", port=port, sslctx=context, timeout=10, retries=0)
+        client = ModbusTlsClient("localhost", port=port, sslctx=context, timeout=60, retries=0)
         assert client.connect()  # type: ignore[no-untyped-call]
         try:
             yield client

@@ -87,7 +87,7 @@ class Site:
     def page(self, path: str, authorization: str) -> int:
         """Collect a page; gives its status."""
         context = ssl.create_default_context(cafile=str(self.folder / "http.crt"))
-        connection = http.client.HTTPSConnection("localhost", self.http, context=context, timeout=10)
+        connection = http.client.HTTPSConnection("localhost", self.http, context=context, timeout=60)
         with contextlib.closing(connection):
             connection.request("GET", path, headers={"Authorization": authorization} if authorization else {})
             reply = connection.getresponse()

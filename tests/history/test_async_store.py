@@ -23,7 +23,7 @@ class SlowStore:
     def __init__(self, directory: Path, session: int) -> None:
         self.closed = False
         self.made.append(self)
-        assert self.may_open.wait(10)
+        assert self.may_open.wait(60)
 
     def close(self) -> None:
         self.closed = True

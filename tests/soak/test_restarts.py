@@ -27,7 +27,7 @@ USER = '[[snmp.user]]\nname = "noc"\nauth_password_file = "{0}/auth"\npriv_passw
 
 def good_reply(port: int) -> bool:
     """Whether array-1 is read."""
-    with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=5) as client:
+    with suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=60) as client:
         client.sendall(READ)
         return client.recv(300)[7:8] == b"\x03"
     return False

@@ -54,7 +54,7 @@ def of(device: Device, **more: str) -> frozenset[tuple[str, str]]:
 
 async def get(url: str) -> str:
     def read() -> str:
-        with urllib.request.urlopen(url, timeout=10) as reply:
+        with urllib.request.urlopen(url, timeout=60) as reply:
             text: str = reply.read().decode()
             return text
 

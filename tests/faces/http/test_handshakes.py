@@ -41,7 +41,7 @@ async def _besieged(make_gateway: MakeGateway, tmp_path: Path) -> None:
     hello = bytes.fromhex("16 0301 0200 01 0001fc 0303")  # the beginning of a ClientHello of 512 bytes
     async with gateway.running(), strangers(gateway, 250) as silent, strangers(gateway, 250, hello) as begun:
         url = gateway.url.replace("http:", "https:")
-        async with ClientSession(timeout=ClientTimeout(total=5)) as session:
+        async with ClientSession(timeout=ClientTimeout(total=60)) as session:
             async with session.get(f"{url}/metrics", ssl=trusting) as reply:
                 assert reply.status == 200
             kept = await asyncio.gather(*(still_open(streams) for streams in (*silent, *begun)))

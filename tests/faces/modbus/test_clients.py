@@ -19,7 +19,7 @@ from .conftest import Running, coil, register
 @pytest.fixture
 async def pymodbus_client(running: Running) -> AsyncIterator[AsyncModbusTcpClient]:
     host, port = running.address
-    client = AsyncModbusTcpClient(host, port=port, timeout=10, retries=0)
+    client = AsyncModbusTcpClient(host, port=port, timeout=60, retries=0)
     assert await client.connect()
     yield client
     client.close()

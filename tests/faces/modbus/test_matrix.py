@@ -96,7 +96,7 @@ async def output_of(*command: str, text: str = "") -> tuple[int, str]:
 
 
 async def by_pymodbus(address: tuple[str, int], steps: list[Step]) -> list[Seen]:
-    client = AsyncModbusTcpClient(address[0], port=address[1], timeout=10, retries=0)
+    client = AsyncModbusTcpClient(address[0], port=address[1], timeout=60, retries=0)
     assert await client.connect()
     seen = []
     for step in steps:

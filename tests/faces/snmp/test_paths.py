@@ -108,7 +108,7 @@ async def test_pysnmp_as_a_poller_reads_the_same_by_v3_as_by_v2c(
     agent = make_agent(users=(a_user(auth=auth, priv=priv),))
     async with listening(agent) as bound:
         engine = hlapi.SnmpEngine()
-        target = await hlapi.UdpTransportTarget.create(bound, timeout=5, retries=0)
+        target = await hlapi.UdpTransportTarget.create(bound, timeout=60, retries=0)
 
         async def bulk(credential: Any) -> list[tuple[Oid, bytes]]:
             names = [hlapi.ObjectType(hlapi.ObjectIdentity(each)) for each in ((*LIVE, 8), (*LIVE, 20))]

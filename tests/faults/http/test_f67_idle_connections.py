@@ -17,6 +17,7 @@ import pytest
 
 from tests.e2e.programs import Launch, wait_until
 from tests.faces.http.test_access import certificate
+from tests.machine import Bystander
 
 STRANGERS = 500
 KEPT = 16
@@ -40,7 +41,7 @@ def strangers(port: int, trusted: ssl.SSLContext | None) -> Iterator[list[socket
     with ExitStack() as stack:
         opened = []
         for number in range(STRANGERS):
-            stranger = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=10))
+            stranger = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=60))
             sends = SENDS[number % len(SENDS)]
             if trusted is not None and number % 2:
                 stranger = stack.enter_context(trusted.wrap_socket(stranger, server_hostname="127.0.0.1"))
@@ -69,7 +70,9 @@ def descriptors(text: str) -> int:
 
 
 @pytest.mark.parametrize("secure", [False, True], ids=["http", "https"])
-def test_a_scrape_is_quick_and_few_are_kept(launch: Launch, tmp_path: Path, *, secure: bool) -> None:
+def test_a_scrape_is_quick_and_few_are_kept(
+    launch: Launch, tmp_path: Path, passing: Bystander, *, secure: bool
+) -> None:
     trusted, keys, kept = None, "", KEPT
     if secure:
         crt, key = certificate(tmp_path)
@@ -80,7 +83,7 @@ def test_a_scrape_is_quick_and_few_are_kept(launch: Launch, tmp_path: Path, *, s
     site.wait_online()
     usual = descriptors(site.get("/metrics")[1])
     with strangers(site.http, trusted) as opened:
-        all_there = time.monotonic()
+        passing.start()
         taken: list[float] = []
         while len(taken) < 5 or (min(taken) >= SCRAPE_S and len(taken) < 50):  # of a busy machine its best
             asked = time.monotonic()
@@ -92,5 +95,5 @@ def test_a_scrape_is_quick_and_few_are_kept(launch: Launch, tmp_path: Path, *, s
         assert min(taken) < SCRAPE_S
         wait_until(lambda: sum(map(is_open, opened)) <= kept, f"{kept} of {STRANGERS} connections at most")
         wait_until(lambda: not any(map(is_open, opened)), "the end of the last of them")
-        assert time.monotonic() - all_there < 3 * HEADER_S, "its time, and a busy machine"
+        assert passing.stop() < 3 * HEADER_S, "its time, and a busy machine"
     assert site.get("/healthz")[0] == 200

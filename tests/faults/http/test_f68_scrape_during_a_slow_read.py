@@ -27,7 +27,7 @@ def test_scrapes_do_not_wait_for_the_line_and_ask_nothing_of_it(launch: Launch) 
     block = most = 0
     while most < 3 and block < 16:  # of a busy machine its best
         scrapes = 0
-        with socket.create_connection(("127.0.0.1", site.modbus), timeout=10) as client:
+        with socket.create_connection(("127.0.0.1", site.modbus), timeout=60) as client:
             client.sendall(struct.pack(">HHHBBHH", 1, 0, 6, 11, 3, DAILY_LOG + block * WORDS, WORDS))
             client.setblocking(False)
             reply = b""

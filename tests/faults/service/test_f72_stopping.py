@@ -9,7 +9,6 @@ import re
 import signal
 import socket
 import struct
-import time
 from collections.abc import Callable
 
 import pytest
@@ -21,11 +20,14 @@ from gateway.service.settings import STOP_GRACE_S
 from tests.faces.modbus.tls.conftest import pki
 from tests.faces.modbus.tls.site import Pki
 from tests.faults.service.rig import QUIET, Service, client, read
+from tests.machine import Bystander
 
 __all__ = ["pki"]
 
 
-async def test_the_wire_is_waited_for_the_queue_is_06_and_nobody_new_gets_in(service: Service) -> None:
+async def test_the_wire_is_waited_for_the_queue_is_06_and_nobody_new_gets_in(
+    service: Service, passing: Bystander
+) -> None:
     service.configure()
     program = service.start()
     await service.online()
@@ -38,7 +40,7 @@ async def test_the_wire_is_waited_for_the_queue_is_06_and_nobody_new_gets_in(ser
         waits.ask(11, read(0x0000, 8, function=1))  # what was polled is older than max_age_s
         waits.ask(11, read(0xE010, 2))
         assert await idle.read(99) == b"\x83\x0a"  # so what came before it is known
-        began = time.monotonic()
+        passing.start()
         program.process.terminate()
         assert await waits.reply() == b"\x81\x06"
         assert await waits.reply() == b"\x83\x06"
@@ -52,7 +54,7 @@ async def test_the_wire_is_waited_for_the_queue_is_06_and_nobody_new_gets_in(ser
         assert await on_the_wire.reply() == expected
         assert await on_the_wire.reply() == b""
     assert await service.ended() == 0
-    assert time.monotonic() - began < 10.0
+    assert passing.stop() < 10.0
     stopping = program.log().partition("event=stopping")[2]
     assert "event=device_stale" in stopping
     assert not re.search("level=(warning|error|critical)|Traceback", stopping)  # it is what was asked for
@@ -117,7 +119,9 @@ def what_became_of_the_write(service: Service) -> tuple[Fate, int | None]:
     return entry.verdict.fate, entry.verdict.exception
 
 
-async def test_a_controller_that_takes_for_ever_is_given_up_after_five_seconds(service: Service) -> None:
+async def test_a_controller_that_takes_for_ever_is_given_up_after_five_seconds(
+    service: Service, passing: Bystander
+) -> None:
     service.configure(line_keys="baudrate = 115200\nreply_timeout_s = 10.0")
     program = service.start()
     await service.online()
@@ -127,16 +131,16 @@ async def test_a_controller_that_takes_for_ever_is_given_up_after_five_seconds(s
     async with client(service.modbus) as asker:
         asker.ask(11, read(0xE000, 2))
         await unit.is_asked(read(0xE000, 2))
-        began = time.monotonic()
+        passing.start()
         program.process.terminate()
         assert await asker.reply() == b"\x83\x06"
         assert await asker.reply() == b""
     assert await service.ended() == 0
-    assert time.monotonic() - began < 10.0
+    assert passing.stop() < 10.0
     assert "Traceback" not in program.log()
 
 
-async def test_a_client_that_reads_nothing_is_cut_off(service: Service) -> None:
+async def test_a_client_that_reads_nothing_is_cut_off(service: Service, passing: Bystander) -> None:
     """What it was told already fills every buffer on the way, so that its connection cannot be closed in order."""
     service.configure(rest="[poll]\nlive_s = 0.2\n")
     program = service.start()
@@ -154,16 +158,16 @@ async def test_a_client_that_reads_nothing_is_cut_off(service: Service) -> None:
         assert sent < 1 << 26
         async with client(service.modbus) as other:
             assert (await other.read(11))[:2] == b"\x03\x04"
-            began = time.monotonic()
+            passing.start()
             program.process.terminate()
             assert await other.reply() == b""
         assert await service.ended() == 0  # the deaf one's socket is still open
-    assert time.monotonic() - began < 8.0
+    assert passing.stop() < 8.0
     assert "Traceback" not in program.log()
 
 
 async def test_half_handshakes_and_half_requests_hold_up_nothing(
-    service: Service, pki: Pki, free_tcp_port: Callable[[], int]
+    service: Service, pki: Pki, free_tcp_port: Callable[[], int], passing: Bystander
 ) -> None:
     files = pki.files()
     tls_port = free_tcp_port()
@@ -183,16 +187,16 @@ client_ca_file = "{files.client_ca}"
         async with client(service.http) as scraper:
             scraper.send(b"GET /metrics HT")
             assert (await service.get("/healthz"))[0] == 200  # so what came before it was read
-            began = time.monotonic()
+            passing.start()
             program.process.terminate()
             for one in (silent, half, frame, scraper):
                 assert await one.reply() == b""
     assert await service.ended() == 0
-    assert time.monotonic() - began < STOP_GRACE_S
+    assert passing.stop() < STOP_GRACE_S
     assert "Traceback" not in program.log()
 
 
-async def test_a_reload_whose_file_hangs_holds_up_nothing(service: Service) -> None:
+async def test_a_reload_whose_file_hangs_holds_up_nothing(service: Service, passing: Bystander) -> None:
     """The pipe is a file on a disk or a network that gives nothing."""
     service.configure()
     program = service.start()
@@ -207,10 +211,10 @@ async def test_a_reload_whose_file_hangs_holds_up_nothing(service: Service) -> N
                 writing = os.open(service.config, os.O_WRONLY | os.O_NONBLOCK)
             await asyncio.sleep(0.01)
     read_on = asyncio.get_running_loop().call_later(15.0, os.close, writing)
-    began = time.monotonic()
+    passing.start()
     program.process.terminate()
     assert await service.ended() == 0
-    assert time.monotonic() - began < 12.0  # it did not wait for the file
+    assert passing.stop() < 12.0  # it did not wait for the file
     read_on.cancel()
     os.close(writing)
     assert "Traceback" not in program.log()

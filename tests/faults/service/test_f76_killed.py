@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import signal
-import time
 
 from tests.faults.service.rig import Service, client, descriptors
+from tests.machine import Bystander
 
 
-async def test_a_killed_gateway_leaves_nothing_and_its_successor_serves_soon(service: Service) -> None:
+async def test_a_killed_gateway_leaves_nothing_and_its_successor_serves_soon(
+    service: Service, passing: Bystander
+) -> None:
     service.configure(rest="[poll]\nlive_s = 0.2\n")
     program = service.start()
     await service.online()
@@ -18,11 +20,11 @@ async def test_a_killed_gateway_leaves_nothing_and_its_successor_serves_soon(ser
         path.name for path in (service.folder / "state").iterdir()
     }
     assert not [name for name in left if "lock" in name.lower() or name.endswith(".pid")]
-    began = time.monotonic()
+    passing.start()
     program = service.start()
     await service.online()
     async with client(service.modbus) as asker:
         assert (await asker.read(11))[0] == 3
-    assert time.monotonic() - began < 15.0
+    assert passing.stop() < 15.0
     assert "line_down" not in program.log()
     assert await service.end() == 0

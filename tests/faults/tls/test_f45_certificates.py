@@ -309,7 +309,7 @@ async def test_f45_a_client_that_expects_another_server_does_not_talk(
 def shake_hands(context: ssl.SSLContext, address: tuple[str, int]) -> None:
     """As a client that connects to "localhost" and sees to it that it is there."""
     assert context.check_hostname
-    with socket.create_connection(address, timeout=10) as plain:
+    with socket.create_connection(address, timeout=60) as plain:
         context.wrap_socket(plain, server_hostname="localhost").close()
 
 

@@ -26,7 +26,7 @@ def _ask(
 ) -> tuple[ssl.SSLSession | None, bool | None]:
     """Connect with an earlier session, read once; what there is to resume with, and whether it was resumed."""
     with (
-        socket.create_connection(address, timeout=10) as plain,
+        socket.create_connection(address, timeout=60) as plain,
         context.wrap_socket(plain, server_hostname="localhost", session=session) as sock,
     ):
         sock.sendall(b"\0\7\0\0\0\6\13" + PDU)

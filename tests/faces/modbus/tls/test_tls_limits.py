@@ -121,7 +121,7 @@ async def test_the_first_request_does_not_wait_for_a_delayed_acknowledgement(ser
 
 def _first_request(context: ssl.SSLContext, address: tuple[str, int]) -> float:
     with (
-        socket.create_connection(address, timeout=10) as plain,  # with Nagle's algorithm, as by default
+        socket.create_connection(address, timeout=60) as plain,  # with Nagle's algorithm, as by default
         context.wrap_socket(plain, server_hostname="localhost") as sock,
     ):
         began = time.perf_counter()

@@ -52,7 +52,7 @@ async def test_pymodbus_with_a_certificate(serve_tls: ServeTls) -> None:
         host,
         port=port,
         sslctx=context,
-        timeout=10,
+        timeout=60,
         retries=0,
     )
     assert await client.connect()
@@ -85,7 +85,7 @@ def _converse(arguments: list[str], request: bytes) -> tuple[bytes, str]:
             process.stdin.flush()
             got = process.stdout.read(7)
             got += process.stdout.read(int.from_bytes(got[4:6]) - 1)
-        out, said = process.communicate(timeout=20)
+        out, said = process.communicate(timeout=60)
     return got, (out + said).decode(errors="replace")
 
 
