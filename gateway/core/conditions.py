@@ -74,7 +74,7 @@ LINE_DOWN = "line_down"
 
 
 def line_condition(index: int) -> Condition:
-    """The condition that the port of a line is not open."""
+    """The condition that the port of a line is not open; `index` is its place in the site, from 1."""
     return Condition(LINE_CODES + index, LINE_DOWN, "port of the line is not open", Severity.CRITICAL)
 
 
@@ -295,7 +295,7 @@ class GatewayConditions(_Set):
         self, lines: Sequence[LinePort], own: Sequence[Condition], now: float, changed: dict[Watch, None]
     ) -> None:
         watches = [Watch(condition, now, None, None) for condition in own]
-        watches += [Watch(line_condition(line.index), now, None, line) for line in lines]
+        watches += [Watch(line_condition(index), now, None, line) for index, line in enumerate(lines, 1)]
         super().__init__(changed, watches, {watch.condition.code: place for place, watch in enumerate(watches)})
         self._raised_since: dict[int, float] = {}
 
@@ -352,13 +352,13 @@ class Conditions:
 
     def look(self, now: float) -> None:
         """Take in the state of every line and device as it is now."""
-        open_since: dict[int, float | None] = {}
-        for line in self._lines:
+        open_since: dict[str, float | None] = {}
+        for index, line in enumerate(self._lines, 1):
             status = line.status(now)
-            open_since[line.index] = status.since if status.state is LineState.OPEN else None
-            self.gateway.line_is(line.index, status.state, status.since, now)
+            open_since[line.name] = status.since if status.state is LineState.OPEN else None
+            self.gateway.line_is(index, status.state, status.since, now)
         for conditions in self.devices.values():
-            conditions.line_is(open_since[conditions.device.line.index])
+            conditions.line_is(open_since[conditions.device.line.name])
             conditions.look(now)
 
     def take(self) -> tuple[Watch, ...]:

@@ -271,7 +271,21 @@ def test_another_site_goes_on_with_what_is_known_of_the_same_lines_and_devices()
     assert plant.conditions.devices[8][100].state is UNKNOWN
     moved = Conditions(Site.of("s", (other,), [new]), (module.HISTORY_DOWN,), plant.now, plant.conditions)
     assert list(moved.devices) == [8]
-    assert 1001 not in moved.gateway
+    assert [watch.line for watch in moved.gateway] == [None, other]
+    assert 1002 not in moved.gateway
+
+
+def test_a_line_has_the_code_of_its_place_in_the_site_whatever_its_index_was_before() -> None:
+    """A site is made while the one before it is in use, whose lines have their old indexes until the change."""
+    plant = Plant()
+    first = FakeLine("b", 1, state=LineState.DOWN)
+    made = Conditions(Site.of("s", (first, plant.line), [plant.device]), (), 0.0, plant.conditions)
+    plant.line.index = 2
+    made.look(10.0)
+    assert [(watch.condition.code, watch.line, watch.state) for watch in made.gateway] == [
+        (1001, first, RAISED),
+        (1002, plant.line, CLEAR),
+    ]
 
 
 def test_a_look_without_news_changes_nothing() -> None:

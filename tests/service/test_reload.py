@@ -132,6 +132,31 @@ async def test_a_line_more_keeps_the_others_and_all_listeners(site: Site) -> Non
         assert list(gateway.conditions.devices) == [12]
 
 
+def lines_by_snmp(gateway: Gateway) -> dict[int, bytes]:
+    """pgwLineName by index."""
+    agent, found = gateway._snmp, {}
+    table = next(table for table in agent.layout.tables if table.name == "pgwLine")
+    name = next(column.number for column in table.columns if column.name == "pgwLineName")
+    for index in range(1, 9):
+        oid = (*table.base, 1, name, index)
+        cell = agent.tree.get(oid, 0.0)
+        if cell is not None:
+            found[index] = cell[-1:]
+    return found
+
+
+async def test_a_line_that_stays_has_its_new_index_in_every_table(site: Site) -> None:
+    async with running(site.config(A, B, FACES, COMMUNITY)) as gateway:
+        for parts, names in (((B,), "b"), ((A, B), "ab"), ((B, A), "ba"), ((A,), "a")):
+            await change(gateway, site.config(*parts, FACES, COMMUNITY))
+            gateway.conditions.look(10.0)
+            codes = {watch.condition.code: watch.line for watch in gateway.conditions.gateway if watch.line is not None}
+            assert {1000 + line.index: line for line in gateway.lines} == codes
+            assert [codes[1001 + place].name for place in range(len(names))] == list(names)
+            assert lines_by_snmp(gateway) == {place: name.encode() for place, name in enumerate(names, 1)}
+        assert not gateway.stats.restarts
+
+
 async def test_a_plan_that_is_not_carried_out_touches_nothing(site: Site) -> None:
     async with running(site.config(A, FACES, COMMUNITY)) as gateway:
         before = (gateway.site, gateway.lines, gateway.listeners, gateway.keepers, gateway.config)

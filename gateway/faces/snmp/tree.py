@@ -274,7 +274,9 @@ def _conditions(gateway: Gateway) -> Rows:
 
 
 _ROWS: Mapping[RowKind, Callable[[Gateway], Rows]] = {
-    RowKind.LINE: lambda gateway: Rows(((line.index,), LineRow(gateway, line)) for line in gateway.site.lines),
+    RowKind.LINE: lambda gateway: Rows(
+        ((index,), LineRow(gateway, line)) for index, line in enumerate(gateway.site.lines, 1)
+    ),
     RowKind.DEVICE: lambda gateway: Rows(((each.unit_id,), DeviceRow(gateway, each)) for each in gateway.site.devices),
     RowKind.CONDITION: _conditions,
     RowKind.CLIENT: lambda _gateway: Rows(()),  # see client_tail.py
