@@ -9,8 +9,6 @@ Rule 2: what cannot be done is said before anything is drawn: a taken port by it
 
 from __future__ import annotations
 
-import errno
-import os
 import signal
 import socket
 import sys
@@ -86,11 +84,6 @@ def command(
     except DemoError as error:
         print(error, file=sys.stderr)
         raise typer.Exit(1) from None
-    except OSError as error:
-        if error.errno not in {errno.EPIPE, errno.EIO}:
-            raise
-        # Nobody reads any more: `demo | head`, or a terminal that was closed.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _free_port() -> int:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -75,10 +73,6 @@ def command(
     except HistoryError as error:
         print(error, file=sys.stderr)
         raise typer.Exit(1) from None
-    except OSError as error:
-        if error.errno != errno.EPIPE:
-            raise
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # `log | head`
 
 
 def _moment(text: str | None, option: str, *, end: bool = False) -> float | None:

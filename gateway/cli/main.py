@@ -6,24 +6,34 @@ file imports nothing but the standard library before the handlers stand.
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
-from io import TextIOWrapper
 from types import FrameType
 
 UNTIL_STOPPED = ("run", "demo", "simulate", "replay")
 """Commands that run until a signal ends them; for the others a signal is an interruption."""
+
+PRINT_ON = (*UNTIL_STOPPED, "log", "trace")
+"""Commands that have more to print than most want to read; for the others a reader that leaves cuts them off."""
 
 
 def main() -> None:
     """Run the command line."""
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _leave)
-    _mend_streams()
+    from gateway.cli.streams import mend  # noqa: PLC0415 - only now are signals handled
+
+    output = mend(0 if sys.argv[1:] and sys.argv[1] in PRINT_ON else 128 + signal.SIGPIPE)
+    try:
+        _command()
+    finally:
+        output.end()
+
+
+def _command() -> None:
     if sys.argv[1:2] == ["run"]:
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})  # it waits until service/process.py can reload
-        from gateway.cli.running import plain_arguments, run  # noqa: PLC0415 - only now are signals handled
+        from gateway.cli.running import plain_arguments, run  # noqa: PLC0415 - as above
 
         arguments = plain_arguments(sys.argv[2:])
         if arguments is not None:
@@ -37,20 +47,6 @@ def main() -> None:
     from gateway.cli.app import app  # noqa: PLC0415 - as above
 
     app(prog_name="prostar-gateway")
-
-
-def _mend_streams() -> None:
-    """Have 0, 1 and 2 lead somewhere, and no letter end a command that standard output has no code for.
-
-    Were one of them closed, the next socket or file would have its number, and what is printed would go there.
-    """
-    while (fd := os.open(os.devnull, os.O_RDWR)) <= 2:
-        os.set_inheritable(fd, True)
-    os.close(fd)
-    if sys.stderr is None:
-        sys.stderr = open(2, "w", closefd=False, encoding="utf-8", errors="backslashreplace")  # noqa: SIM115 - for good
-    if isinstance(sys.stdout, TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _leave(number: int, _frame: FrameType | None) -> None:
