@@ -24,7 +24,7 @@ step = @printf '  %-34s' '$(1)'; log=$$(mktemp); trap 'rm -f "$$log"' EXIT; \
 
 .PHONY: help
 help: ## Show this list.
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-11s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 .PHONY: demo
 demo: $(VENV)/.runtime ## Run simulated controllers, the gateway and its three faces; Ctrl-C stops.

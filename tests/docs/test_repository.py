@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 import tomllib
 from pathlib import Path
 
@@ -84,6 +85,12 @@ def test_every_target_of_the_makefile_is_explained() -> None:
     phony = set(re.findall(r"^\.PHONY: (.+)$", makefile, re.MULTILINE))
     explained = set(re.findall(r"^([a-z-]+):.*## \S", makefile, re.MULTILINE))
     assert phony == explained
+
+
+def test_make_help_is_two_columns() -> None:
+    done = subprocess.run(["make", "help"], cwd=ROOT, capture_output=True, text=True, check=True)
+    explained = [line.index(re.split(r" make \S+ +", line)[1]) for line in done.stdout.splitlines()]
+    assert set(explained) == {19}
 
 
 def named_tests() -> list[tuple[str, str]]:
