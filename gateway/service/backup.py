@@ -9,6 +9,8 @@ Rule 3: an SNMP engine never has a number of boots twice (RFC 3414 §2.2). A res
         that may have been used since the backup, which a start a second at most could not have reached. With a clock
         that stands before the backup that cannot be told: the engine is left out, and the gateway makes a new one.
 Rule 4: restored files belong to whom the folder belongs to, for the gateway is seldom root.
+Rule 5: until it is whole everything is in a folder beside, which goes away with the work, also upon a signal. Of a
+        backup or restore that was killed that folder stays; the next one there removes it.
 """
 
 from __future__ import annotations
@@ -40,6 +42,8 @@ MOST_BYTES = 16 << 30  # of one file; an archive is input like any other
 TRIES = 20
 LAST_MOMENT = datetime(9999, 1, 1, tzinfo=UTC).timestamp()
 
+_WORK = ".prostar-gateway-unfinished-"
+_ARCHIVE = ".tar"  # in a folder of copies, none of which begins so
 _DATABASE = b"SQLite format 3\0"
 _BESIDE = ("-wal", "-shm", "-journal")
 
@@ -58,22 +62,19 @@ def back_up(state_dir: Path, site: str, target: Path, now: float) -> tuple[str, 
     """Write what is in `state_dir` to a tar archive; gives the names in it. BackupError leaves no archive."""
     if not target.name or target.is_dir():
         raise BackupError(f"{target}: is a folder; an archive is a file")
-    beside = target.with_name(target.name + ".new")
     try:
-        beside.unlink(missing_ok=True)  # of a backup that was killed
-        with tempfile.TemporaryDirectory(prefix=".backup-", dir=target.parent) as folder:
-            names = _collect(state_dir, Path(folder))
+        with _work(target.parent) as folder:
+            names = _collect(state_dir, folder)
             text = json.dumps(asdict(Manifest(FORMAT, __version__, site, now)), ensure_ascii=False)
-            (Path(folder) / MANIFEST).write_text(text + "\n", encoding="utf-8")
-            with _create(beside) as file:
+            (folder / MANIFEST).write_text(text + "\n", encoding="utf-8")
+            with _create(folder / _ARCHIVE) as file:
                 with tarfile.open(fileobj=file, mode="w", format=tarfile.PAX_FORMAT) as archive:
                     for name in (MANIFEST, *names):
-                        archive.add(Path(folder) / name, arcname=name, recursive=False)
+                        archive.add(folder / name, arcname=name, recursive=False)
                 file.flush()
                 os.fsync(file.fileno())
-        beside.replace(target)
+            (folder / _ARCHIVE).replace(target)
     except (OSError, sqlite3.Error) as error:
-        beside.unlink(missing_ok=True)
         raise BackupError(f"{target}: {error}") from error
     return names
 
@@ -85,13 +86,25 @@ def restore(archive: Path, state_dir: Path, now: float) -> tuple[Manifest, Path 
         with held(state_dir) as mine:
             if not mine:
                 raise BackupError(f"{state_dir}: a gateway uses it; stop that first")
-            with tempfile.TemporaryDirectory(prefix=".restore-", dir=state_dir) as name:
-                folder = Path(name)
+            with _work(state_dir) as folder:
                 manifest = _unpack(archive, folder)
                 _go_on_above(folder / engine.FILE_NAME, state_dir / engine.FILE_NAME, manifest.made_at, now)
                 return manifest, _exchange(folder, state_dir, now)
     except (OSError, sqlite3.Error, tarfile.TarError) as error:
         raise BackupError(f"{archive}: {error}") from error
+
+
+@contextlib.contextmanager
+def _work(parent: Path) -> Iterator[Path]:
+    """A folder in `parent` for the length of the block (rule 5); who works in one holds it."""
+    for left in parent.glob(f"{_WORK}*/"):
+        with contextlib.suppress(OSError), held(left) as mine:
+            if mine:
+                shutil.rmtree(left)
+    with tempfile.TemporaryDirectory(prefix=_WORK, dir=parent) as name, contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # a file system without locks: there nothing is removed either
+            stack.enter_context(held(Path(name)))
+        yield Path(name)
 
 
 def _create(path: Path) -> BinaryIO:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sqlite3
 import subprocess
 import sys
@@ -306,11 +307,61 @@ def test_why_there_is_no_backup_is_said(state: Path, tmp_path: Path, monkeypatch
         back_up(tmp_path / "no state", "ridge-07", tmp_path / "backup.tar", MADE)
 
 
-def test_what_a_killed_backup_left_hinders_no_other(state: Path, tmp_path: Path) -> None:
-    (tmp_path / "backup.tar.new").write_text("half of it")
+def ends_amid(command: str, archive: Path, state: Path, number: signal.Signals) -> None:
+    """Run `backup` or `restore`, and have it get a signal while its copies are there and what it makes is not."""
+    config = state.parent / "site.toml"
+    minimal = (Path(__file__).parents[2] / "config" / "minimal.toml").read_text()
+    config.write_text(f'state_dir = "{state}"\n{minimal}')
+    code = (
+        "import os, sys\nfrom gateway.cli.main import main\nfrom gateway.service import backup\n"
+        f"backup.os.fsync = lambda _fd: os.kill(os.getpid(), {int(number)})\n"
+        f"sys.argv = ['prostar-gateway', {command!r}, '-c', {str(config)!r}, {str(archive)!r}]\nmain()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    expected = -number if number is signal.SIGKILL else 128 + number
+    assert (done.returncode, done.stderr) == (expected, "")
+    config.unlink()
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_of_a_backup_that_was_ended_nothing_stays_when_there_is_another(
+    state: Path, tmp_path: Path, number: signal.Signals
+) -> None:
+    ends_amid("backup", tmp_path / "monday.tar", state, number)
+    left = [name for name in names(tmp_path) if name.startswith(".prostar-gateway-unfinished-")]
+    assert sorted(left) == [name for name in names(tmp_path) if name != "state"]
+    assert len(left) == (number is signal.SIGKILL)
+    back_up(state, "ridge-07", tmp_path / "tuesday.tar", MADE)
+    assert names(tmp_path) == ["state", "tuesday.tar"]
+    assert "history.sqlite3" in members(tmp_path / "tuesday.tar")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_of_a_restore_that_was_ended_nothing_stays_when_there_is_another(
+    state: Path, tmp_path: Path, number: signal.Signals
+) -> None:
     back_up(state, "ridge-07", tmp_path / "backup.tar", MADE)
-    assert not (tmp_path / "backup.tar.new").exists()
-    assert "history.sqlite3" in members(tmp_path / "backup.tar")
+    before = names(state)
+    ends_amid("restore", tmp_path / "backup.tar", state, number)
+    assert len(names(state)) == len(before) + (number is signal.SIGKILL)
+    _, moved = restore(tmp_path / "backup.tar", state, LATER)
+    assert moved is not None
+    assert [path.name for path in state.iterdir() if path.is_dir()] == [moved.name]
+
+
+def test_a_backup_does_not_take_another_ones_folder_away(state: Path, tmp_path: Path) -> None:
+    work = tmp_path / ".prostar-gateway-unfinished-another"
+    work.mkdir()
+    with held(work) as mine:
+        assert mine
+        back_up(state, "ridge-07", tmp_path / "backup.tar", MADE)
+        assert work.exists()
+    back_up(state, "ridge-07", tmp_path / "backup.tar", MADE)
+    assert names(tmp_path) == ["backup.tar", "state"]
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
