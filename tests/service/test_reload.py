@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import sys
+import weakref
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ from gateway.clock import SystemClock
 from gateway.errors import ConfigError
 from gateway.faces.snmp.agent import SnmpAgent
 from gateway.history.keeper import HistoryKeeper
+from gateway.lines.factory import Line
 from gateway.service.config import Config, parse_config
 from gateway.service.gateway import Gateway
 from gateway.service.logs import Log
@@ -155,6 +157,33 @@ async def test_a_line_that_stays_has_its_new_index_in_every_table(site: Site) ->
             assert [codes[1001 + place].name for place in range(len(names))] == list(names)
             assert lines_by_snmp(gateway) == {place: name.encode() for place, name in enumerate(names, 1)}
         assert not gateway.stats.restarts
+
+
+async def test_nothing_is_kept_of_what_went(site: Site) -> None:
+    """Reload upon reload, each with something else, must not fill the memory of a gateway that runs for years."""
+    writing = '[[modbus.write]]\nsource = ["127.0.0.1"]\npoint = ["float_voltage"]\n'
+    faces = FACES.replace("[http]", f"writes = true\n{writing}[http]")
+    port = '[[modbus.listener]]\nline = "{}"\nlisten = ["127.0.0.1:0"]\n'
+    receiver = site.receiver(9)
+    first = site.config(A, B, port.format("a"), faces, COMMUNITY, receiver)
+    others = (
+        site.config(B, FACES, COMMUNITY, receiver, site.user("noc")),
+        site.config(LINE.format(name="c", unit=11), port.format("c"), faces, COMMUNITY, receiver),
+        site.config(LINE.format(name="a", unit=12), faces, COMMUNITY, "[history]\nenabled = false\n"),
+        first,
+    )
+    async with running(first) as gateway:
+        gone: list[weakref.ref[Line]] = []  # whose devices know it
+        for config in (*others, *others):
+            gone += map(weakref.ref, gateway.lines)
+            await change(gateway, config)
+        tasks = len(asyncio.all_tasks())
+        await change(gateway, others[0])
+        await change(gateway, first)
+        gc.collect()
+        left = [line for each in gone if (line := each()) is not None and line not in gateway.lines]
+        assert left == []
+        assert len(asyncio.all_tasks()) == tasks
 
 
 async def test_a_plan_that_is_not_carried_out_touches_nothing(site: Site) -> None:

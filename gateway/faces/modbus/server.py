@@ -14,7 +14,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -161,7 +161,8 @@ class ModbusServer:
         self._started_at = clock.monotonic()
         self._shared = self._share(settings, site)
         self.dispatcher = Dispatcher({}, clock, self._shared)
-        self._of_line: dict[str, Dispatcher] = {}
+        self._barred = Dispatcher({}, clock, self._shared, barred=True)
+        self._of_line: Mapping[str, Dispatcher] = {}
         self._route(settings, site)
         if settings.tls is not None:
             self.door = self._new_door(settings.tls)
@@ -219,16 +220,19 @@ class ModbusServer:
         if settings.status_unit:
             own = StatusRegisters(site, self.stats, started_at=self._started_at, version=__version__)
         self.dispatcher.reroute(routes.by_unit(), self._shared, own)
-        for group in settings.lines:
-            dispatcher = self._of_line.setdefault(group.line, Dispatcher({}, self._clock, self._shared))
-            dispatcher.reroute(routes.of_line(group.line), self._shared)
+        self._barred.reroute({}, self._shared)
+        names = {group.line for group in settings.lines}
+        known = self._of_line
+        self._of_line = {name: known.get(name) or Dispatcher({}, self._clock, self._shared) for name in names}
+        for name, dispatcher in self._of_line.items():
+            dispatcher.reroute(routes.of_line(name), self._shared)
 
     def _new_door(self, settings: TlsSettings) -> TlsDoor:
         from gateway.faces.modbus.tls import TlsDoor  # noqa: PLC0415 - as said above
 
         self.stats.tls = TlsStats()
-        barred = Dispatcher({}, self._clock, self._shared, barred=True)
-        return TlsDoor(settings, barred, self._clock, self.stats.tls, frame_timeout_s=self.settings.frame_timeout_s)
+        timeout_s = self.settings.frame_timeout_s
+        return TlsDoor(settings, self._barred, self._clock, self.stats.tls, frame_timeout_s=timeout_s)
 
     def _listeners(self) -> tuple[Listener, ...]:
         """The listeners of the settings; those that there are already are taken."""

@@ -6,7 +6,8 @@ Rule 2: a write that has begun goes on when its client leaves; one that has not 
 Rule 3: as long as the ledger (journal.py) cannot be opened or written, writes are refused with 04; reads know
         nothing of it.
 Rule 4: what nobody knows is read back before the next write to the device, and every `SETTLE_S` while the device is
-        online; so is, after a start, what the last run left open.
+        online; so is, after a start, what the last run left open. Another device that has its unit id by then is not
+        asked.
 """
 
 from __future__ import annotations
@@ -117,10 +118,11 @@ class Writer:
     def adjust(self, settings: WriteSettings, site: Site) -> None:
         """Other rules, limits and devices from now on; the ledger stays, and so does what was begun."""
         self._rules = {device.unit_id: WriteRules(settings.rules, device) for device in site.devices}
-        self._devices = {**self._devices, **site.by_unit}
+        busy = self._running | {unit for unit, waiting in self._waiting.items() if waiting}
+        kept = {unit: device for unit, device in self._devices.items() if unit in busy}
+        self._devices = {**kept, **site.by_unit}
         self._wear.limit(settings.limits)
-        for unit in site.by_unit:
-            self._waiting.setdefault(unit, deque())
+        self._waiting = {unit: self._waiting.get(unit, deque()) for unit in self._devices}
 
     def refuse_waiting(self) -> None:
         """Answer those that wait: nobody may write any more."""
@@ -174,7 +176,7 @@ class Writer:
     # One device's writes, one after another
 
     def _next(self, unit: int, *, settled: bool = False) -> None:
-        if unit in self._running:
+        if unit in self._running or unit not in self._devices:
             return
         waiting = self._waiting[unit]
         while waiting and waiting[0].done is None:
@@ -183,7 +185,7 @@ class Writer:
             self._open_ledger()
             return
         device = self._devices[unit]
-        intents = [intent for intent in self._unsettled.values() if intent.unit_id == unit]
+        intents = [each for each in self._unsettled.values() if each.unit_id == unit and self._device_of(each)]
         if intents and not settled and device.snapshot.state is DeviceState.ONLINE:
             self._running.add(unit)
             steps = settle(intents, device)
@@ -302,7 +304,7 @@ class Writer:
             for cell, times in book.worn.items():
                 for at in times:
                     self._wear.restore(cell, wall - at, now)
-            self._unsettled = {id_: intent for id_, intent in book.open.items() if intent.unit_id in self._devices}
+            self._unsettled = {id_: intent for id_, intent in book.open.items() if self._device_of(intent)}
             if book.skipped:
                 logger.warning("event=write_ledger_damaged lines=%d", book.skipped)
             self._settle_later()
@@ -327,12 +329,18 @@ class Writer:
                     self._leave_open(intent)
 
     def _leave_open(self, intent: Intent) -> None:
-        point = self._devices[intent.unit_id].map.writable_point(intent.space, intent.address)
+        device = self._device_of(intent)
+        point = None if device is None else device.map.writable_point(intent.space, intent.address)
         if point is not None and can_be_read_back(point):
             self._unsettled[intent.id] = intent
             while len(self._unsettled) > MAX_OPEN:
                 del self._unsettled[next(iter(self._unsettled))]
             self._settle_later()
+
+    def _device_of(self, intent: Intent) -> Device | None:
+        """The device that a write went to; None where its unit id stands for another one by now, or for none."""
+        device = self._devices.get(intent.unit_id)
+        return device if device is not None and device.name == intent.device else None
 
     def _moment(self, outcome: Outcome = b"") -> Moment:
         return Moment(self._clock.monotonic(), self._clock.wall(), outcome)

@@ -14,6 +14,7 @@ import asyncio
 import logging
 import socket
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 
 import gateway
 from gateway.clock import Clock
@@ -32,7 +33,7 @@ from gateway.faces.snmp.engine import Engine, EngineLost, start_engine
 from gateway.faces.snmp.layout import Layout, shipped_layout
 from gateway.faces.snmp.log_table import LogDays
 from gateway.faces.snmp.notifier import Notifier
-from gateway.faces.snmp.objects import Gateway
+from gateway.faces.snmp.objects import Gateway, ticks_since
 from gateway.faces.snmp.responder import DATAGRAM_LIMIT, Refused, Responder
 from gateway.faces.snmp.security import Security
 from gateway.faces.snmp.settings import SnmpSettings
@@ -109,7 +110,7 @@ class SnmpAgent:
         self._responder = Responder(settings, contexts, self.counters)
         self._throttle = Throttle()
         self._site_name = site.name
-        self._ticks = described.ticks
+        self._ticks = partial(ticks_since, self.started_at)  # receivers that stay keep it, and no site with it
         self.notifier = self._new_notifier(None)
         self._listen_to_failures()
         self.listeners: tuple[SnmpListener, ...] = ()

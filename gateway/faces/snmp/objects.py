@@ -79,7 +79,12 @@ class Gateway:
 
     def ticks(self, at: float) -> int:
         """Moment `at` as sysUpTime, hundredths of a second; 0 for moments before the start."""
-        return max(0, int((at - self.started_at) * 100))
+        return ticks_since(self.started_at, at)
+
+
+def ticks_since(started_at: float, at: float) -> int:
+    """Hundredths of a second from one moment to another; 0 where that is before it."""
+    return max(0, int((at - started_at) * 100))
 
 
 @dataclass(frozen=True, slots=True)

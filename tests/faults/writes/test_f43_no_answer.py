@@ -6,13 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from gateway.core.site import Outcome
+from gateway.core.site import Device, Outcome, Site
+from gateway.core.snapshot import DeviceState, Snapshot
 from gateway.core.write_ledger import Fate
 from gateway.errors import ReplyMismatch, ReplyTimeout, Unconfirmed
 from gateway.faces.modbus import writer
 from tests.core.test_engine import Registers
 from tests.core.virtual_line import make_line
-from tests.faces.modbus.writing import writing
+from tests.faces.modbus.writing import MAP, ControllerLine, writing
 
 WRITE = bytes.fromhex("06 e000 4b64")
 
@@ -64,6 +65,57 @@ async def test_one_that_a_restart_interrupted_is_settled_by_the_next_run(tmp_pat
     async with writing(tmp_path, line=line) as it:
         assert await it.query("05 0002 ff00") == "050002ff00"
         await it.until(lambda: it.fates() == [Fate.NOT_WRITTEN, Fate.WRITTEN])
+
+
+def devices(line: ControllerLine, *addresses: int) -> Site:
+    """A site like that of `writing`, with the controllers of these addresses as units 11, 12 and so on."""
+    found = [
+        Device(f"array-{address}", unit, address, MAP, snapshot=Snapshot(state=DeviceState.ONLINE))
+        for unit, address in enumerate(addresses, 11)
+    ]
+    for device in found:
+        device.line = line
+    return Site.of("ridge-07", [line], found)
+
+
+async def test_another_controller_that_has_the_unit_id_by_then_is_not_asked(tmp_path: Path) -> None:
+    """A reload may give unit ids to others; to read back there would settle what nobody knows by a foreign register."""
+    async with writing(tmp_path) as it:
+        it.poll()
+        it.line.lost.update(write=1, read=1)
+        assert await it.query("05 0001 ff00") == "850b"
+        await it.until(lambda: it.fates() == [Fate.UNKNOWN])
+        server, line, writer = it.server, it.line, it.server.writer
+        assert writer is not None
+        line.held = True
+        for addresses in ((2, 1), (2,), ()):
+            server.adjust(server.settings, devices(line, *addresses), None)
+            writer._settle_now()
+            assert not line.waiting
+        server.adjust(server.settings, devices(line, 1, 2), None)
+        writer._settle_now()
+        assert [ticket.device.address for ticket in line.waiting] == [1]
+        line.release()
+        await it.until(lambda: it.fates() == [Fate.WRITTEN])
+
+
+@pytest.mark.parametrize("addresses", [(2, 1), ()])
+async def test_one_that_is_sent_while_its_unit_id_goes_ends_as_it_began(
+    tmp_path: Path, addresses: tuple[int, ...]
+) -> None:
+    async with writing(tmp_path) as it:
+        it.poll()
+        it.line.held = True
+        it.ask("05 0002 ff00")
+        await it.until(lambda: it.line.waiting)
+        it.server.adjust(it.server.settings, devices(it.line, *addresses), None)
+        it.line.lost.update(write=1, read=1)
+        it.line.release()
+        assert await it.answer() == "850b"
+        await it.until(lambda: it.fates() == [Fate.UNKNOWN])
+        it.server.adjust(it.server.settings, devices(it.line, *addresses), None)
+        assert it.server.writer is not None
+        assert sorted(it.server.writer._devices) == [11 + place for place in range(len(addresses))]
 
 
 class Deaf(Registers):
