@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import ssl
 from collections.abc import Mapping
-from http.client import HTTPConnection, HTTPSConnection
+from http.client import HTTPConnection, HTTPException, HTTPSConnection
 from typing import NamedTuple
 
+from gateway.cli.printable import printable
 from gateway.service.parsing import Address
 
 TIMEOUT_S = 5.0
@@ -21,7 +22,10 @@ class Answer(NamedTuple):
 
 
 def ask(address: Address, path: str, tls: ssl.SSLContext | None, headers: Mapping[str, str]) -> Answer:
-    """GET a path, by HTTPS with `tls`; OSError or HTTPException when there is no answer."""
+    """GET a path, by HTTPS with `tls`; OSError or HTTPException when there is no answer.
+
+    Whatever listens there may have answered: its words, in `reason` and in an HTTPException, can be shown.
+    """
     connection = (
         HTTPConnection(address.reached_at, address.port, timeout=TIMEOUT_S)
         if tls is None
@@ -30,6 +34,8 @@ def ask(address: Address, path: str, tls: ssl.SSLContext | None, headers: Mappin
     try:
         connection.request("GET", path, headers={"Connection": "close", **headers})
         reply = connection.getresponse()
-        return Answer(reply.status, reply.reason, reply.read())
+        return Answer(reply.status, printable(reply.reason), reply.read())
+    except HTTPException as error:
+        raise HTTPException(printable(str(error).strip())) from None
     finally:
         connection.close()

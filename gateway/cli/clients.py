@@ -60,11 +60,13 @@ def _ask(http: HttpTable) -> Mapping[str, Any]:
         answer = ask(address, PATH, _tls(http), _credentials(http))
         if answer.status != 200:
             raise _Unreachable(f"{where}: {answer.status} {answer.reason}")
-        document: Mapping[str, Any] = json.loads(answer.body)
+        document: Any = json.loads(answer.body)
     except (OSError, HTTPException, ValueError) as error:
         raise _Unreachable(f"{where}: {getattr(error, 'strerror', None) or error}; is the gateway running?") from None
     except ListenError as error:
         raise _Unreachable(str(error)) from None
+    if not isinstance(document, dict) or not isinstance(document.get("clients"), list):
+        raise _Unreachable(f"{where}: what answers there is no gateway")
     return document
 
 

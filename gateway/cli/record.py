@@ -20,6 +20,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from gateway.cli.config_file import ConfigOption, part_or_exit
+from gateway.cli.printable import printable
 from gateway.cli.stopping import Stop, stop_event
 from gateway.modbus.recording import Piece, Recording
 from gateway.service.tracing import FILE_NAME
@@ -134,7 +135,8 @@ async def _replay(port: PtyLine | TcpServer[ReplayedServer], recording: Recordin
     stopped = stop_event(_SIGNALS)
     async with port:
         where = port.path if isinstance(port, PtyLine) else port.url
-        print(f"{recording.about.get('line', '?')} with {requests} different requests at {where}", flush=True)
+        line = printable(str(recording.about.get("line", "?")))  # a file may be anybody's
+        print(f"{line} with {requests} different requests at {where}", flush=True)
         await stopped.wait()
 
 

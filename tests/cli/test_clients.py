@@ -199,6 +199,32 @@ def test_the_configured_certificate_is_enough(tmp_path: Path, kind: str) -> None
         gateway.stop()
 
 
+@pytest.mark.parametrize(
+    ("answer", "text"),
+    [
+        (b"HTTP/1.1 500 \x1b[31mred\r\ncontent-length: 0\r\n\r\n", "500 ?[31mred"),
+        (b"HTTP/1.1 200 ok\r\ncontent-length: 3\r\n\r\n[1]", "what answers there is no gateway"),
+        (b"HTTP/1.1 200 ok\r\ncontent-length: 2\r\n\r\n{}", "what answers there is no gateway"),
+    ],
+)
+def test_something_else_that_answers_is_named(tmp_path: Path, answer: bytes, text: str) -> None:
+    def serve() -> None:
+        connection, _ = server.accept()
+        with connection:
+            connection.recv(1000)
+            connection.sendall(answer)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        path = tmp_path / "gateway.toml"
+        path.write_text(CONFIG.format(folder=tmp_path, modbus=free_port(), http=port, more=""))
+        thread = Thread(target=serve)
+        thread.start()
+        said = run("-c", str(path))
+        thread.join()
+    assert said == (1, "", f"http://127.0.0.1:{port}/api/v1/clients: {text}\n")
+
+
 def test_a_gateway_that_does_not_run_is_named(tmp_path: Path) -> None:
     gateway = Running(tmp_path)
     gateway._loop.close()

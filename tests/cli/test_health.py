@@ -91,7 +91,12 @@ def test_one_that_hangs_is_given_up(
 
 
 @pytest.mark.parametrize(
-    ("answer", "text"), [(b"HTTP/1.1 503 No\r\ncontent-length: 0\r\n\r\n", "503"), (b"SSH-2.0-x\r\n", "SSH-2.0-x")]
+    ("answer", "text"),
+    [
+        (b"HTTP/1.1 503 No\r\ncontent-length: 0\r\n\r\n", "503"),
+        (b"SSH-2.0-x\r\n", "SSH-2.0-x"),
+        (b"\x1b]0;x\x07\x9b2J\r\n", "?]0;x??2J"),
+    ],
 )
 def test_another_answer_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str], answer: bytes, text: str) -> None:
     def serve(server: socket.socket) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import socket
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Thread
@@ -12,6 +13,8 @@ import pytest
 from typer.testing import CliRunner
 
 from gateway.cli.app import app
+from gateway.modbus.recording import header_line
+from tests.e2e.programs import GATEWAY
 
 CONFIG = """
 site = "ridge-07"
@@ -57,3 +60,13 @@ def test_a_gateway_that_does_not_answer_is_named(tmp_path: Path, command: str, c
     assert (done.exit_code, done.stdout) == (1, "")
     assert done.stderr == f"the gateway at {tmp_path / 'trace'} gives no answer\n"
     assert not recording.exists()
+
+
+def test_the_name_in_somebodys_recording_does_nothing_to_the_terminal(tmp_path: Path) -> None:
+    recording = tmp_path / "line.rec"
+    recording.write_text(header_line({"line": "a\x1b[31m\nb"}) + "\n")
+    with subprocess.Popen([*GATEWAY, "replay", str(recording)], stdout=subprocess.PIPE, text=True) as replay:
+        assert replay.stdout is not None
+        assert replay.stdout.readline().startswith("a?[31m?b with 0 different requests at /dev/pts/")
+        replay.terminate()
+        assert replay.wait(30) == 0

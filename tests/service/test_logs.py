@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import ast
 import io
 import json
 import logging
 import os
+import re
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -141,3 +144,28 @@ def test_the_level_of_the_command_line_goes_before_the_files(root: logging.Logge
         found.append((root.level, type(writer.formatter)))
     assert found == [(logging.WARNING, JsonFormatter), (logging.ERROR, EventFormatter)]
     writer.close()
+
+
+OURS = {
+    ("core/line_news.py", "event=device_%s line=%s device=%s address=%d before=%s lasted_s=%.1f%s"),  # states
+    ("faces/modbus/dispatch.py", "%s"),  # a line of core/policy.py: codes, addresses, and roles, which have no quotes
+    ("faces/modbus/tls.py", "event=tls_refused peer=%s reason=%s left_out=%d%s"),  # DNS names and IP addresses alone
+    ("faces/modbus/writer.py", "%s"),  # as of dispatch.py
+    ("service/conditions.py", "event=condition unit_id=%d %s=%s"),  # a condition of a map
+}
+"""Messages with a text that is not quoted where it stands, because it is the gateway's own."""
+
+
+def test_every_text_in_an_event_stands_where_it_is_quoted() -> None:
+    """Who adds a message with a text at another place sees to it that it holds nothing of a peer."""
+    package = Path(__file__).parents[2] / "gateway"
+    loose = set()
+    for path in package.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            match node:
+                case ast.Call(ast.Attribute(ast.Name("log" | "_log" | "logger")), args):
+                    texts = [arg.value for arg in args if isinstance(arg, ast.Constant) and isinstance(arg.value, str)]
+                    for text in texts[:1]:
+                        if re.search(r'(?<![="])%s', text):
+                            loose.add((path.relative_to(package).as_posix(), text))
+    assert loose == OURS

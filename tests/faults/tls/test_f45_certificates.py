@@ -18,6 +18,7 @@ from gateway.faces.modbus.tls_files import load
 from gateway.faces.modbus.tls_names import wanted_names
 from gateway.faces.modbus.tls_session import REASONS
 from gateway.modbus import mbap
+from gateway.service.logs import EventFormatter
 from tests.faces.modbus.conftest import read
 from tests.faces.modbus.tls.conftest import ServeTls, TlsSite
 from tests.faces.modbus.tls.site import SERVER, Pki, role, utf8
@@ -222,6 +223,27 @@ async def test_f45_no_other_entry_and_no_common_name_is_taken_for_a_name(serve_t
     pki.issue("scada.example.net", names=(), extensions=[READER, others])  # that is its common name too
     await is_refused(site, "scada.example.net")
     assert site.stats.refused == {"name_not_allowed": 1}
+
+
+@pytest.mark.parametrize(
+    "evil", ['x\n" level=error event=forged\r\n', '\x1b[31m\x7f.example.net"\\', "historian.example.net\n", '"']
+)
+async def test_f45_no_name_in_a_certificate_writes_into_the_log(
+    serve_tls: ServeTls, pki: Pki, caplog: pytest.LogCaptureFixture, evil: str
+) -> None:
+    site = await serve_tls(tls={"client_names": wanted_names(OPERATORS)})
+    pki.issue("named", names=(evil, "historian.example.net", f"{evil}.example.net"), extensions=[READER])
+    pki.issue("roled", names=OPERATORS[:1], extensions=[role(utf8(evil))])
+    cases = (
+        ("named", "name_not_allowed", "its names: DNS:historian.example.net"),
+        ("roled", "role_malformed", "a role has 1 to 64 printable characters and no quotes"),
+    )
+    for name, reason, why in cases:
+        with caplog.at_level(logging.INFO):
+            await is_refused(site, name)
+            await site.running.until(lambda: reason in site.stats.refused)  # noqa: B023 - waited for in its turn
+        expected = f'event=tls_refused peer=127.0.0.1 reason={reason} left_out=0 why="{why}"'
+        assert EventFormatter().format(caplog.records[-1]).endswith(f" level=warning {expected}")
 
 
 async def test_f45_a_certificate_is_good_at_its_own_address_only(
