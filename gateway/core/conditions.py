@@ -176,7 +176,7 @@ class _Set:
     @property
     def worst(self) -> Severity | None:
         """The worst severity of a raised condition, None when none is raised."""
-        return max((severity for severity, count in self._active.items() if count), default=None)
+        return max((severity for severity, count in self.active.items() if count), default=None)
 
     def __iter__(self) -> Iterator[Watch]:
         """Every watch, by code."""
@@ -306,8 +306,12 @@ class GatewayConditions(_Set):
             place = self._places.get(watch.condition.code)
             if place is not None and self._watches[place].line is watch.line:
                 self._watches[place] = watch
-                if watch.state is ConditionState.RAISED:
-                    self._active[watch.condition.severity] += 1
+
+    @property
+    def active(self) -> Mapping[Severity, int]:
+        """How many conditions of each severity are raised; those before, whose watches are shared, may still change."""
+        raised = [watch.condition.severity for watch in self if watch.state is ConditionState.RAISED]
+        return {severity: raised.count(severity) for severity in Severity}
 
     def line_is(self, index: int, state: LineState, since: float, now: float) -> None:
         """Learn the state of a line, and since when it has it."""
@@ -366,6 +370,11 @@ class Conditions:
         changed = tuple(self._changed)
         self._changed.clear()
         return changed
+
+    def at(self, unit_id: int, code: int) -> Watch | None:
+        """The watch of this unit id (GATEWAY_UNIT: of the gateway and its lines) and code, where there is one."""
+        of: _Set | None = self.gateway if unit_id == GATEWAY_UNIT else self.devices.get(unit_id)
+        return of[code] if of is not None and code in of else None
 
     def __iter__(self) -> Iterator[Watch]:
         """Every watch: those of the gateway, then by unit id; by code."""

@@ -227,6 +227,7 @@ class Gateway:
         if plan.snmp is not None:
             self._snmp_settings, self._days = plan.snmp.settings, plan.days
             self._snmp.adjust(plan.snmp)
+            self._snmp.notifier.go_on(plan.conditions)
             self._tell(tuple(plan.conditions.active()), self._clock.monotonic())  # receivers that are new know nothing
         self._http.adjust(
             http_settings(config),

@@ -7,9 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.core.announcing import Announcement, Announcer
-from gateway.core.conditions import ConditionState, Severity
+from gateway.core.conditions import Conditions, ConditionState, Severity
+from gateway.core.site import Device, Site
 from gateway.core.snapshot import DeviceState
-from tests.core.test_conditions import Plant
+from tests.core.test_conditions import MAP, FakeLine, Plant
 
 
 class Story:
@@ -127,6 +128,80 @@ def test_there_is_room_for_so_many() -> None:
     story.shows(array_faults=0xFFF)
     assert len(story.take(5)) == 5
     assert len(story.take()) == 7
+
+
+def reloaded(story: Story, *names: str) -> None:
+    """A reload: a device of that name is unit 7 on a line of its own, or none is."""
+    plant = story.plant
+    plant.line, devices = FakeLine(), []
+    for name in names:
+        plant.device = Device(name, 7, 1, MAP)
+        plant.device.line = plant.line
+        devices.append(plant.device)
+    plant.conditions = Conditions(Site.of("s", (plant.line,), devices), (), plant.now, plant.conditions)
+    story.announcer.go_on(plant.conditions)
+    story.hear()
+
+
+def test_what_was_told_before_a_reload_is_told_as_clear_when_it_is() -> None:
+    """Somebody mends the cable, writes another device into the file, and reloads: the line and its devices are new."""
+    for name in ("d", "another"):
+        story = Story()
+        story.shows(array_faults=1)
+        assert story.take() == ["100 raised"]
+        reloaded(story, name)
+        story.plant.wait(60)
+        assert story.take() == []
+        story.shows()
+        assert story.take() == ["100 clear"]
+        story.plant.wait(60)
+        story.shows(array_faults=1)
+        assert story.take() == ["100 raised"]
+
+
+def test_what_is_raised_after_a_reload_too_is_not_told_again() -> None:
+    story = Story()
+    for fault in (1, 0, 1):
+        story.plant.wait(60)
+        story.shows(array_faults=fault)
+        story.take()
+    reloaded(story, "d")
+    story.plant.wait(60)
+    story.shows(array_faults=1)
+    assert story.take() == []
+    story.plant.wait(60)
+    story.shows()
+    assert story.take() == ["100 clear"]
+    story.plant.wait(60)
+    story.shows(array_faults=1)
+    assert story.take() == ["100 raised"]
+
+
+def test_what_waits_of_a_device_that_goes_is_not_told() -> None:
+    for names in (("another",), ()):
+        story = Story()
+        story.shows(array_faults=1)
+        under_way = story.announcer.take(story.plant.now, 1)
+        story.shows(array_faults=3)
+        reloaded(story, *names)
+        assert story.take() == []
+        assert len(story.announcer) == 0
+        story.announcer.confirmed(under_way[0].watch)
+        assert story.take() == []
+        reloaded(story, "d")
+        story.plant.wait(60)
+        story.shows(array_faults=2)
+        assert story.take() == [*(["100 clear"] if names else []), "101 raised summary"]
+
+
+def test_a_trap_that_was_lost_during_a_reload_is_told_again_only_of_what_holds() -> None:
+    for names in (("d",), ()):
+        story = Story()
+        story.shows(array_faults=1)
+        under_way = story.announcer.take(story.plant.now, 1)
+        reloaded(story, *names)
+        story.announcer.lost(under_way[0])
+        assert story.take() == []
 
 
 def test_nothing_more_is_told_before_it_is_confirmed() -> None:

@@ -275,6 +275,21 @@ def test_another_site_goes_on_with_what_is_known_of_the_same_lines_and_devices()
     assert 1002 not in moved.gateway
 
 
+def test_what_changes_while_a_site_is_made_counts_once() -> None:
+    """Those who are made go on with what those before them learn until they take their place."""
+    plant = Plant((module.HISTORY_DOWN, module.NOT_READY))
+    before = plant.conditions
+    before.gateway.tell(module.NOT_READY, raised=True, now=0.0)
+    made = Conditions(Site.of("s", (plant.line,), [plant.device]), (module.HISTORY_DOWN, module.NOT_READY), 0.0, before)
+    before.gateway.tell(module.HISTORY_DOWN, raised=True, now=1.0)
+    before.gateway.tell(module.NOT_READY, raised=False, now=1.0)
+    assert made.gateway.active == {Severity.INFO: 0, Severity.WARNING: 1, Severity.CRITICAL: 0}
+    assert made.gateway.worst is Severity.WARNING
+    made.gateway.tell(module.HISTORY_DOWN, raised=False, now=2.0)
+    assert set(made.gateway.active.values()) == {0}
+    assert made.gateway.worst is None
+
+
 def test_a_line_has_the_code_of_its_place_in_the_site_whatever_its_index_was_before() -> None:
     """A site is made while the one before it is in use, whose lines have their old indexes until the change."""
     plant = Plant()

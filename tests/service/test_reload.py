@@ -8,11 +8,13 @@ import sys
 import weakref
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from gateway.clock import SystemClock
+from gateway.core.snapshot import DeviceState
 from gateway.errors import ConfigError
 from gateway.faces.snmp.agent import SnmpAgent
 from gateway.history.keeper import HistoryKeeper
@@ -224,6 +226,22 @@ async def test_a_receiver_that_stays_is_told_what_was_left_and_a_new_one_what_is
         assert new is not post
         await change(gateway, site.config(A, B, FACES, COMMUNITY))
         assert gateway._snmp.notifier not in gateway.keepers
+
+
+async def test_a_receiver_that_was_told_of_a_device_is_told_of_it_when_its_line_is_a_new_one(site: Site) -> None:
+    receiver = site.receiver(9)
+    async with running(site.config(A, FACES, COMMUNITY, receiver)) as gateway:
+        device = gateway.site.by_unit[11]
+        device.snapshot = replace(device.snapshot, state=DeviceState.OFFLINE)
+        gateway._watching.look()
+        (post,) = gateway._snmp.notifier._posts
+        told = post.delivery._announcer._told
+        assert told[11, 401].watch is gateway.conditions.at(11, 401)
+        await change(gateway, site.config(A.replace("address = 1", "address = 2"), FACES, COMMUNITY, receiver))
+        told = post.delivery._announcer._told
+        assert told[11, 401].watch is gateway.conditions.at(11, 401)
+        await change(gateway, site.config(B, FACES, COMMUNITY, receiver))
+        assert (11, 401) not in post.delivery._announcer._told
 
 
 async def test_a_mistake_in_the_middle_of_a_change_ends_the_process_for_a_new_start(

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from itertools import islice
 
 from gateway.core.announcing import Announcement, Announcer
-from gateway.core.conditions import Watch
+from gateway.core.conditions import Conditions, Watch
 from gateway.core.ratelimit import Bucket
 from gateway.core.stats import NotifyStats
 from gateway.faces.snmp import notifications
@@ -86,6 +86,10 @@ class Delivery:
     def changed(self, watches: Iterable[Watch], now: float) -> None:
         """The state of these conditions changed."""
         self._announcer.changed(watches, now)
+
+    def go_on(self, conditions: Conditions) -> None:
+        """There are these conditions from now on; what is under way about others goes on until it is acknowledged."""
+        self._announcer.go_on(conditions)
 
     def authentication_failed(self, now: float) -> None:
         """Somebody used a wrong credential."""

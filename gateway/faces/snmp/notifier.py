@@ -15,7 +15,7 @@ import socket
 from collections.abc import Callable, Sequence
 
 from gateway.clock import Clock
-from gateway.core.conditions import Watch
+from gateway.core.conditions import Conditions, Watch
 from gateway.core.stats import NotifyStats
 from gateway.faces.snmp.delivery import Delivery, Note
 from gateway.faces.snmp.engine import Engine, EngineLost
@@ -73,6 +73,11 @@ class Notifier:
         for post in self._posts:
             post.delivery.changed(watches, now)
             post.wake.set()
+
+    def go_on(self, conditions: Conditions) -> None:
+        """There are these conditions from now on."""
+        for post in self._posts:
+            post.delivery.go_on(conditions)
 
     def authentication_failed(self, _host: str) -> None:
         """A message with a wrong credential came."""
