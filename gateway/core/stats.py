@@ -6,7 +6,8 @@ Plain mutable numbers on one loop: an increment is the whole cost.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from dataclasses import dataclass, field
+from collections.abc import Container
+from dataclasses import dataclass, field, replace
 
 from gateway.core.histogram import Histogram
 from gateway.modbus.counters import RtuCounters, UpstreamCounters
@@ -133,3 +134,7 @@ class HistoryStats:
     devices: dict[int, DeviceHistoryStats] = field(default_factory=dict)  # by unit id
     store_up: bool = True  # False: what was read cannot be stored
     store_errors: Counter[str] = field(default_factory=Counter)  # kind → count
+
+    def of(self, units: Container[int]) -> HistoryStats:
+        """The same for another site, of which these units are as before; the others begin anew."""
+        return replace(self, devices={unit: stats for unit, stats in self.devices.items() if unit in units})

@@ -77,6 +77,7 @@ class Gateway:
             self.site, clock, not_ready=self.not_ready, history=self._history, state_dir=kept.directory
         )
         self._snmp_settings = snmp_settings(config)
+        self._days: LogKeeper | None = None
         self._days = self._log_keeper(self._snmp_settings, config, self.site, self._history)
         self._snmp = self._agent(self._snmp_settings, self.site, self._watching.conditions, self._days)
         self._http = HttpFace(
@@ -184,6 +185,8 @@ class Gateway:
         """Build what another configuration wants; nothing is touched. ConfigError when it cannot be had."""
         south = await asyncio.to_thread(South.of, config, self._clock, self._south)
         history = (self._history or HistoryStats()) if config.history.enabled else None
+        if history is not None and south.site is not self.site:
+            history = history.of(south.unchanged(self._south))
         conditions = self.conditions
         if south.site is not self.site or (history is None) is not (self._history is None):
             conditions = ConditionKeeper.of(south.site, history, self._clock.monotonic(), conditions)
@@ -206,13 +209,12 @@ class Gateway:
         try:
             settings = snmp_settings(config)
         except ConfigError as error:
-            problems += error.problems
-        else:
-            if settings != self._snmp_settings or conditions is not self.conditions:
-                days = self._log_keeper(settings, config, south.site, history)
-                agent = self._agent(settings, south.site, conditions, days, self._snmp)
+            raise ConfigError((*problems, *error.problems)) from None
         if problems:
             raise ConfigError(tuple(problems))
+        if settings != self._snmp_settings or conditions is not self.conditions:
+            days = self._log_keeper(settings, config, south.site, history)
+            agent = self._agent(settings, south.site, conditions, days, self._snmp)
         return Plan(config, south, conditions, history, agent, days, access, https, tls)
 
     async def change(self, plan: Plan) -> None:
@@ -274,6 +276,8 @@ class Gateway:
         source = self._log(config)
         if source is None or history is None or not settings.log_table or not (settings.communities or settings.users):
             return None
+        if self._days is not None and self._days.fits(site, history):
+            return self._days  # an agent for other users shows what is there, and not an empty table until it is read
         return LogKeeper(site, source, history)
 
     def _log(self, config: Config) -> HistorySource | None:

@@ -60,6 +60,12 @@ class South:
         """The lines alone."""
         return tuple(built.line for built in self.built)
 
+    def unchanged(self, before: South) -> frozenset[int]:
+        """The unit ids that stand for the same names of line and device as before."""
+        places = {(device.unit_id, device.line.name, device.name) for device in before.site.devices}
+        here = self.site.devices
+        return frozenset(each.unit_id for each in here if (each.unit_id, each.line.name, each.name) in places)
+
     def adjust_lines(self, before: South) -> None:
         """Have the lines that stayed work by their new settings."""
         old = {built.line: built.settings for built in before.built}

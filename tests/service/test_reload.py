@@ -199,6 +199,46 @@ async def test_a_plan_that_is_not_carried_out_touches_nothing(site: Site) -> Non
         assert (gateway.site, gateway.lines, gateway.listeners, gateway.keepers, gateway.config) == before
 
 
+async def test_a_refused_plan_says_nothing_of_what_it_would_have_been(
+    site: Site, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with running(site.config(A, FACES, COMMUNITY, site.user("noc"))) as gateway:
+        caplog.set_level("INFO")
+        bad = FACES.replace("[http]", f'[http]\nbearer_token_file = "{site.folder}/none"')
+        with pytest.raises(ConfigError):
+            await gateway.plan(site.config(A, bad, COMMUNITY, site.user("noc"), site.user("admin")))
+        assert "event=snmp_v3_on" not in caplog.text
+        await change(gateway, site.config(A, FACES, COMMUNITY, site.user("noc"), site.user("admin")))
+        assert "event=snmp_v3_on" in caplog.text
+
+
+async def test_what_is_known_of_a_daily_log_is_never_shown_of_another_device(site: Site) -> None:
+    async with running(site.config(A, B, FACES)) as gateway:
+        assert gateway._history is not None
+        for unit in (11, 12):
+            known = gateway._history.devices[unit]
+            known.harvests, known.days = 3, 5
+        kept = gateway._history.devices[12]
+        await change(gateway, site.config(A.replace("a-1", "other"), B, FACES))
+        fresh = gateway._history.devices[11]
+        assert (fresh.harvests, fresh.days or 0) == (0, 0)
+        assert gateway._history.devices[12] is kept
+        assert kept.harvests == 3
+        await change(gateway, site.config(B.replace("12", "13"), FACES))
+        assert list(gateway._history.devices) == [13]
+
+
+async def test_the_log_table_is_not_empty_for_a_while_when_users_are_others(site: Site) -> None:
+    async with running(site.config(A, FACES, COMMUNITY)) as gateway:
+        days = gateway._days
+        assert days is not None
+        await change(gateway, site.config(A, FACES, COMMUNITY, site.user("noc")))
+        assert gateway._days is days
+        assert days in gateway.keepers
+        await change(gateway, site.config(A, B, FACES, COMMUNITY))
+        assert gateway._days is not days
+
+
 async def test_snmpv3_comes_with_its_first_user_and_goes_with_its_last(site: Site) -> None:
     async with running(site.config(A, FACES, COMMUNITY)) as gateway:
         agent = gateway._snmp

@@ -37,6 +37,10 @@ class LogKeeper:
         self._sleep = sleep
         self._seen: dict[int, object] = {}
 
+    def fits(self, site: Site, stats: HistoryStats) -> bool:
+        """Whether it is the keeper for these."""
+        return site is self._site and stats is self._stats
+
     async def run(self) -> None:
         """Look again and again whether something was stored."""
         while True:
