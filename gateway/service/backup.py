@@ -3,6 +3,7 @@
 Rule 1: a backup disturbs nobody and may be made while the gateway writes. Each file is in it as it was at one moment:
         databases by SQLite's own backup, ledgers up to their last whole line, the rest by one read, since those files
         are only ever replaced whole. What was set aside as damaged is never written again: it is copied as it is.
+        Archives that somebody keeps there are left out: the next would have all of them in it, and twice the size.
 Rule 2: nothing is restored below a gateway that runs (service/state_dir.py knows), and nothing of what was there is
         lost: it moves into a folder beside. An archive is checked whole before anything is moved.
 Rule 3: an SNMP engine never has a number of boots twice (RFC 3414 §2.2). A restored one goes on above every number
@@ -136,7 +137,8 @@ def _collect(state_dir: Path, folder: Path) -> tuple[str, ...]:
                 continue
             if as_opened != as_it_is:
                 continue
-            for path, file in opened:
+            kept = [(path, file) for path, file in opened if not _is_archive(file)]
+            for path, file in kept:
                 head = file.read(len(_DATABASE))
                 file.seek(0)
                 if head == _DATABASE and ASIDE not in path.name:
@@ -146,8 +148,20 @@ def _collect(state_dir: Path, folder: Path) -> tuple[str, ...]:
                     if ".jsonl" in path.name:
                         data = data[: data.rfind(b"\n") + 1]
                     (folder / path.name).write_bytes(data)
-            return tuple(path.name for path, _ in opened)
+            return tuple(path.name for path, _ in kept)
     raise BackupError(f"{state_dir}: files come and go too fast")
+
+
+def _is_archive(file: BinaryIO) -> bool:
+    """Whether a backup is in it, and then nothing else."""
+    try:
+        with tarfile.open(fileobj=file, mode="r:") as archive:
+            first = archive.next()
+            return first is not None and first.name == MANIFEST
+    except tarfile.TarError:
+        return False
+    finally:
+        file.seek(0)
 
 
 def _copy_database(path: Path, copy: Path) -> None:

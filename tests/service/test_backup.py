@@ -162,6 +162,13 @@ def test_what_was_backed_up_while_it_was_written_is_whole(state: Path, tmp_path:
     assert len(set(seen)) > 1  # it did go on meanwhile
 
 
+def test_archives_that_are_kept_in_state_dir_are_in_none(state: Path, tmp_path: Path) -> None:
+    for name in ("monday.tar", "tuesday.tar"):
+        assert back_up(state, "ridge-07", state / name, MADE) == (FILE_NAME, engine.FILE_NAME, NAME)
+    restore(state / "tuesday.tar", state, LATER)
+    assert history(state) == (1, 1)
+
+
 def test_what_was_there_is_kept_beside(state: Path, tmp_path: Path) -> None:
     archive = tmp_path / "backup.tar"
     back_up(state, "ridge-07", archive, MADE)
