@@ -6,6 +6,7 @@ Rule 2: who may connect is who may enter `state_dir`: the gateway's own user and
 Rule 3: one who reads slower than the line talks loses pieces, and is told how many by the end of the connection;
         nobody waits for it. There are at most `WATCHERS`.
 Rule 4: a `state_dir` that takes no socket is said once; it is tried again every `AGAIN_S`.
+Rule 5: a line that a reload takes away, or puts another one in the place of, says nothing more: the recording ends.
 
 The question is one line, the name of the line as JSON text; the answer is a recording (modbus/recording.py), or a line
 `{"error": …}`.
@@ -32,6 +33,8 @@ WATCHERS = 4
 MOST_UNREAD = 1 << 20
 QUESTION_S = 5.0
 AGAIN_S = 60.0
+LOOK_S = 1.0
+"""How often it is looked whether the line is still there."""
 
 _log = logging.getLogger(__name__)
 
@@ -109,9 +112,14 @@ class Tracer:
         writer.write(f"{header_line(_about(line, self._clock))}\n".encode())
         _log.info("event=trace line=%s state=on", line.name)
         line.tap.open(watch)
+        closed = asyncio.create_task(reader.read())  # nobody has anything more to say
         try:
-            await reader.read()  # until it is closed: nobody has anything more to say
+            while not closed.done() and line in self._lines():
+                await asyncio.wait((closed,), timeout=LOOK_S)
+            if closed.done():
+                closed.result()
         finally:
+            closed.cancel()
             line.tap.close(watch)
             lasted_s = self._clock.monotonic() - began
             _log.info("event=trace line=%s state=off lasted_s=%.1f lost=%d", line.name, lasted_s, lost)

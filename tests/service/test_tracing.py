@@ -52,3 +52,31 @@ async def test_who_does_not_read_loses_pieces_which_are_counted_and_is_given_the
     assert int(lost[1]) > TOLD / 2
     assert len(got) < 2 * tracing.MOST_UNREAD
     assert len(Recording.parse(got.splitlines()).pieces) == TOLD - int(lost[1])
+
+
+async def test_a_line_that_a_reload_takes_away_ends_what_is_made_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    monkeypatch.setattr(tracing, "LOOK_S", 0.01)
+    device = Device("array-1", 11, 1, UNKNOWN)
+    before, after = make_line(tmp_path / "none", device), make_line(tmp_path / "none", device)
+    lines = [before]
+    tracer = asyncio.create_task(Tracer(tmp_path, lambda: lines, SystemClock()).run())
+    path = tmp_path / FILE_NAME
+    await until(path.exists)
+    for line in (before, after):
+        lines[:] = [line]
+        reader, writer = await asyncio.open_unix_connection(path)
+        writer.write(b'"shelter-a"\n')
+        await until(lambda line=line: bool(line.tap))  # type: ignore[misc]
+        line.tap.tell(SystemClock().monotonic(), sent=True, data=PIECE)
+        lines.clear()
+        async with asyncio.timeout(30):
+            assert len(Recording.parse((await reader.read()).decode().splitlines()).pieces) == 1
+        assert not line.tap
+        writer.close()
+    assert caplog.text.count("state=off") == 2
+    tracer.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await tracer
