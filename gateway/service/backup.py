@@ -91,7 +91,9 @@ def restore(archive: Path, state_dir: Path, now: float) -> tuple[Manifest, Path 
                 manifest = _unpack(archive, folder)
                 _go_on_above(folder / engine.FILE_NAME, state_dir / engine.FILE_NAME, manifest.made_at, now)
                 return manifest, _exchange(folder, state_dir, now)
-    except (OSError, sqlite3.Error, tarfile.TarError) as error:
+    except tarfile.TarError as error:
+        raise BackupError(f"{archive}: is no whole backup of a gateway: {error}") from error
+    except (OSError, sqlite3.Error) as error:
         raise BackupError(f"{archive}: {error}") from error
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
 import signal
@@ -280,9 +281,12 @@ def test_a_strange_archive_changes_nothing(state: Path, tmp_path: Path, spoil: d
 
 
 def test_something_that_is_no_archive_is_said(state: Path, tmp_path: Path) -> None:
-    (tmp_path / "no.tar").write_bytes(b"hello")
-    with pytest.raises(BackupError, match=r"no\.tar"):
-        restore(tmp_path / "no.tar", state, LATER)
+    back_up(state, "ridge-07", tmp_path / "backup.tar", MADE)
+    whole = (tmp_path / "backup.tar").read_bytes()
+    for data in (b"hello", b"", gzip.compress(whole), whole[:5000]):
+        (tmp_path / "no.tar").write_bytes(data)
+        with pytest.raises(BackupError, match=r"no\.tar: is no whole backup of a gateway: "):
+            restore(tmp_path / "no.tar", state, LATER)
     with pytest.raises(BackupError, match=r"missing\.tar"):
         restore(tmp_path / "missing.tar", state, LATER)
 
