@@ -110,7 +110,7 @@ class ServiceStats:
 
     reloads: Counter[str] = field(default_factory=Counter)  # what became of it → count
     reload_works: bool = True  # whether the file was right when it was last read
-    configured_at: float = 0.0  # wall time at which the configuration in use was taken
+    configured_at: float = 0.0  # monotonic, when the configuration in use was taken
     restarts: Counter[str] = field(default_factory=Counter)  # task → how often a bug ended it
     log: LogStats = field(default_factory=LogStats)
 

@@ -67,7 +67,7 @@ class Gateway:
         self.config = config
         self._clock = clock
         self._south = south = South.of(config, clock)
-        self.stats = ServiceStats(configured_at=clock.wall())
+        self.stats = ServiceStats(configured_at=clock.monotonic())
         self._modbus_stats = ModbusServerStats()
         self._modbus = ModbusServer(modbus_settings(config), self.site, clock, self._modbus_stats)
         self._history = HistoryStats() if config.history.enabled else None

@@ -87,7 +87,7 @@ class Reloader:
             return
         self._log.use(config.log.level, config.log.form)
         self._stats.reloads["applied"] += 1
-        self._stats.configured_at = self._clock.wall()
+        self._stats.configured_at = self._clock.monotonic()
         self._stats.reload_works = True
         if gateway.site is not site:  # it takes the loop a tenth of a second: only for what lasts
             set_aside()

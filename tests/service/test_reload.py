@@ -228,6 +228,16 @@ async def test_what_is_known_of_a_daily_log_is_never_shown_of_another_device(sit
         assert list(gateway._history.devices) == [13]
 
 
+async def test_an_engine_that_starts_while_another_agent_is_made_starts_once(site: Site) -> None:
+    """A second start would leave the traps of the first one outside of everybody's time window."""
+    async with running(site.config(A, FACES, COMMUNITY)) as gateway:
+        plan = await gateway.plan(site.config(A, FACES, COMMUNITY, site.user("noc")))
+        engine = gateway._snmp.engine()
+        await gateway.change(plan)
+        assert gateway._snmp.engine() is engine
+        assert speaks_v3(gateway._snmp)
+
+
 async def test_the_log_table_is_not_empty_for_a_while_when_users_are_others(site: Site) -> None:
     async with running(site.config(A, FACES, COMMUNITY)) as gateway:
         days = gateway._days

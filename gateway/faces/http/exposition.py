@@ -44,21 +44,21 @@ class Exposition:
         self._devices = DeviceMetrics(site)
         self._began = clock.monotonic()
         self._offset_s = clock.wall() - self._began
-        self._own = OwnMetrics(site, counts, self._started_at)
+        self._own = OwnMetrics(site, counts, self._began, self._wall)
 
     def adjust(self, site: Site, counts: Counts) -> None:
         """Tell of another site from now on; a scrape under way ends as it began. MapError as for a new one."""
         if site is not self._site:
             self._devices = DeviceMetrics(site)
         self._site = site
-        self._own = OwnMetrics(site, counts, self._started_at)
+        self._own = OwnMetrics(site, counts, self._began, self._wall)
 
-    def _started_at(self) -> float:
-        """When the gateway started, by the clock as it is set now: one that was wrong then is not believed for ever."""
+    def _wall(self, at: float) -> float:
+        """Wall time of a monotonic moment, by the clock as it is set now: one that was wrong then is not believed."""
         offset_s = self._clock.wall() - self._clock.monotonic()
         if abs(offset_s - self._offset_s) > CLOCK_STEP_S:
             self._offset_s = offset_s
-        return self._began + self._offset_s
+        return at + self._offset_s
 
     async def pieces(self, form: Format) -> AsyncIterator[bytes]:
         """The exposition in pieces of about `PIECE_BYTES`, a turn of the loop between two of them."""

@@ -64,30 +64,39 @@ GATEWAY_RULES: tuple[Rule[GatewayView], ...] = (
     ),
 )
 
-SERVICE_RULES: tuple[Rule[ServiceStats], ...] = (
+
+@dataclass(frozen=True, slots=True)
+class ServiceView:
+    """What the process did, and the wall time at which its configuration was read."""
+
+    stats: ServiceStats
+    configured_at: float
+
+
+SERVICE_RULES: tuple[Rule[ServiceView], ...] = (
     one(
         gateway_gauge(
             "config_last_reload_successful", "1 while the configuration that was last read is the one in use."
         ),
-        lambda stats: stats.reload_works,
+        lambda view: view.stats.reload_works,
     ),
     one(
         gateway_gauge(
             "config_last_reload_success_timestamp_seconds", "When the configuration in use was read, Unix time."
         ),
-        lambda stats: stats.configured_at,
+        lambda view: view.configured_at,
     ),
     each(
         gateway_counter("config_reloads", "Times that the configuration was read again, by outcome.", "outcome"),
-        lambda stats: dict.fromkeys(("applied", "refused"), 0) | stats.reloads,
+        lambda view: dict.fromkeys(("applied", "refused"), 0) | view.stats.reloads,
     ),
     each(
         gateway_counter("task_restarts", "Times that a task died of a bug and was started again.", "task"),
-        lambda stats: stats.restarts,
+        lambda view: view.stats.restarts,
     ),
     one(
         gateway_counter("log_lines_dropped", "Lines of the log that nobody took in time."),
-        lambda stats: stats.log.dropped,
+        lambda view: view.stats.log.dropped,
     ),
 )
 
@@ -237,10 +246,11 @@ class Counts:
 class OwnMetrics:
     """The gateway's own metrics, each line and counter read once a scrape."""
 
-    def __init__(self, site: Site, counts: Counts, started_at: Callable[[], float]) -> None:
-        """`started_at` gives the wall time of the start, by the clock as it is set now."""
+    def __init__(self, site: Site, counts: Counts, began: float, wall: Callable[[float], float]) -> None:
+        """`wall` gives the wall time of a monotonic moment, as `began` is one, by the clock as it is set now."""
         self._counts = counts
-        self._started_at = started_at
+        self._began = began
+        self._wall = wall
         self._lines = [Source.labelled(line, LINE_LABELS, (line.name, site.of_line(line.name))) for line in site.lines]
         self._devices = [Source.labelled(device, DEVICE_LABELS, device_labels(site, device)) for device in site.devices]
 
@@ -255,9 +265,9 @@ class OwnMetrics:
         """Each family that has samples, with its lines; conditions as they were at the last `look`."""
         counts = self._counts
         lines = [Source(LineView(line.of, line.of.status(now)), line.labels, line.written) for line in self._lines]
-        yield from families(GATEWAY_RULES, [Source(GatewayView(self._started_at(), not counts.not_ready()))])
-        if counts.service is not None:
-            yield from families(SERVICE_RULES, [Source(counts.service)])
+        yield from families(GATEWAY_RULES, [Source(GatewayView(self._wall(self._began), not counts.not_ready()))])
+        if (service := counts.service) is not None:
+            yield from families(SERVICE_RULES, [Source(ServiceView(service, self._wall(service.configured_at)))])
         yield from families(LINE_RULES, lines)
         yield from families(DEVICE_RULES, self._devices)
         yield from families(MODBUS_RULES, [Source(counts.modbus)])

@@ -127,7 +127,7 @@ class SnmpAgent:
         is another one only where its receivers or what they are told are others.
         """
         before = (self.settings.receivers, self.settings.enterprise_root, self._site_name)
-        self.settings, self._engine, self._site_name = fresh.settings, fresh._engine, fresh._site_name
+        self.settings, self._site_name = fresh.settings, fresh._site_name
         self.layout, self.tree, self._trees = fresh.layout, fresh.tree, fresh._trees
         self._responder = fresh._responder
         if before != (self.settings.receivers, self.settings.enterprise_root, self._site_name):

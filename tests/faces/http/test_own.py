@@ -105,6 +105,17 @@ def test_version_and_start(site: Site, clock: ManualClock) -> None:
     assert found["prostar_gateway_start_time_seconds"].value == clock.date - 60
 
 
+def test_a_clock_that_is_set_later_moves_the_moments_that_it_told(site: Site, clock: ManualClock) -> None:
+    """A machine without a clock of its own starts in 1970: the configuration was not read then."""
+    exposition = Exposition(site, clock, Counts(service=ServiceStats(configured_at=clock.now)))
+    name = "prostar_gateway_config_last_reload_success_timestamp_seconds"
+    for step_s in (0.0, 1.8e9, 3600.0):
+        clock.date += step_s
+        found = {sample.name: sample for family in parse(scrape(exposition)) for sample in family.samples}
+        assert found[name].value == pytest.approx(clock.date)
+        assert found["prostar_gateway_start_time_seconds"].value == pytest.approx(clock.date)
+
+
 def test_what_is_collected_is_what_is_described(site: Site, clock: ManualClock) -> None:
     modbus = ModbusServerStats(tls=TlsStats(1, Counter(timeout=1), not_after=2e9))
     modbus.exceptions[2] = 1
