@@ -475,7 +475,7 @@ class LineEngine:
         record.breaker.replied()
 
     def _judge(self, record: DeviceRecord, now: float) -> None:
-        state = self._polling.judge(record)
+        state = self._polling.judge(record, now)
         if state is record.state:
             return
         self._change(record, state, now, reason="silent" if state is DeviceState.OFFLINE else "")

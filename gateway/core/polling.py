@@ -218,7 +218,7 @@ class Polling:
                 record.forget(space, block.first, block.last + 1)
                 item.due = now
 
-    def judge(self, record: DeviceRecord) -> DeviceState:
+    def judge(self, record: DeviceRecord, now: float) -> DeviceState:
         """The state that follows (rule 3); the caller publishes it."""
         live = [item for item in record.polls.items if _shows_life(item)]
         if record.breaker.is_open:
@@ -231,7 +231,7 @@ class Polling:
                 record.known = record.known.learned(record.seen())
             return DeviceState.ONLINE
         asking = any(item.block is None and item not in live for item in record.polls.items)
-        if asking or (not complete and not self._stranger(record)) or not self._verify(record):
+        if asking or (not complete and not self._stranger(record)) or not self._verify(record, now):
             return record.state
         return DeviceState.ONLINE
 
@@ -255,7 +255,7 @@ class Polling:
         """Whether what it said by now tells that it is another unit; one of another model may never answer the plan."""
         return record.known.complaint(record.seen(), record.device.map.identity.growing) is not None
 
-    def _verify(self, record: DeviceRecord) -> bool:
+    def _verify(self, record: DeviceRecord, now: float) -> bool:
         """Rule 4."""
         complaint = record.known.complaint(record.seen(), record.device.map.identity.growing)
         if record.warn(IDENTITY_MISMATCH, on=complaint is not None):
@@ -264,10 +264,17 @@ class Polling:
                 log.error('event=identity_mismatch device=%s reason="%s"', record.device.name, complaint)
             else:
                 log.info("event=identity_restored device=%s", record.device.name)
+                self._as_usual(record, now)
         record.verified = complaint is None
         if complaint is None:
             record.known = record.known.learned(record.seen())
         return record.verified
+
+    def _as_usual(self, record: DeviceRecord, now: float) -> None:
+        """What was to be looked at in a minute is read in its own time again."""
+        for item in record.polls.items:
+            if item.period_s is not None and not item.refused:
+                item.due = min(item.due, now + item.period_s)
 
     def _insist(self, item: PollItem, record: DeviceRecord, now: float) -> None:
         """Rule 8."""

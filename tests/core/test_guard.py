@@ -179,6 +179,19 @@ def test_the_right_unit_is_known_again_though_nobody_saw_the_other_one_go(virtua
     assert line.devices[0].snapshot.serial_number == MINE
 
 
+def test_the_right_unit_is_read_as_often_as_before_once_it_is_back(virtual_line: MakeLine) -> None:
+    mine, other = pair()
+    line = virtual_line(mine)
+    line.run(5.0)
+    reopened(line, other)
+    line.run(100.0)
+    swap(line, mine)
+    while state(line) is not DeviceState.ONLINE:
+        line.run(0.1)
+    line.run(3.0)
+    assert all(block.read_at > line.now - 2.0 for block in line.devices[0].snapshot.blocks if block.first == 0)
+
+
 @pytest.mark.parametrize("looks", range(1, 8))
 def test_nothing_that_was_read_of_the_other_unit_is_ever_shown(virtual_line: MakeLine, looks: int) -> None:
     mine, other = SimulatedController(MAP, seed=1), SimulatedController(MAP, seed=4)
