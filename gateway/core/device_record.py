@@ -15,7 +15,7 @@ from types import MappingProxyType
 
 from gateway.core.doubt import Doubt
 from gateway.core.health import Breaker
-from gateway.core.identity import Identity
+from gateway.core.identity import Identity, Kept
 from gateway.core.scheduler import PollList
 from gateway.core.site import Device
 from gateway.core.snapshot import Block, DeviceState, Snapshot, holds
@@ -93,7 +93,7 @@ class DeviceRecord:
         self._keepers = _keepers(device.map)
         self._blocks: list[Block] = []  # no address is in two of them
         self._scaling: dict[str, Value] = {}  # what the device last told of it, since the line was opened
-        self._stored: tuple[Mapping[str, tuple[Value, ...]], float] = ({}, 0.0)  # as of `Identity`
+        self._stored: Mapping[str, Kept] = {}  # as of `Identity`
         device.snapshot = Snapshot(state_since=now)
 
     @property
@@ -117,7 +117,6 @@ class DeviceRecord:
         snapshot = self.device.snapshot
         identification = snapshot.identification
         growing = self.device.map.identity.growing
-        stored, stored_at = self._stored
         counters = {rule.point: self.values[rule.point] for rule in growing if rule.point in self.values}
         return Identity(
             product=None if identification is None else identification.product,
@@ -125,8 +124,7 @@ class DeviceRecord:
             serial_number=snapshot.serial_number,
             counters=counters,
             at=max((snapshot.read_at[point] for point in counters), default=0.0),
-            stored=stored,
-            stored_at=stored_at,
+            stored=self._stored,
         )
 
     def store(self, block: Block, now: float) -> None:
@@ -142,9 +140,9 @@ class DeviceRecord:
                 self._decode(each, values, texts)
         self.device.stats.implausible = self._decoder.implausible
         self._show(values, texts, last_reply_at=now)
-        stored = self._kept_in(block)
-        if stored:
-            self._stored = ({**self._stored[0], **stored}, block.read_at)
+        kept = self._kept_in(block)
+        if kept:
+            self._stored = {**self._stored, **kept}
 
     def forget(self, space: Space, first: int, end: int) -> None:
         """Drop what was read of these addresses: it was written, or is no longer read as one block."""
@@ -176,7 +174,7 @@ class DeviceRecord:
         self.live_started_at = None
         self._blocks = []
         self._scaling.clear()
-        self._stored = ({}, 0.0)
+        self._stored = {}
         self._publish(identification=None, serial_number=None)
 
     def warn(self, warning: str, *, on: bool) -> bool:
@@ -194,7 +192,7 @@ class DeviceRecord:
         self._publish(state=state, state_since=now)
         return lasted_s
 
-    def _kept_in(self, block: Block) -> dict[str, tuple[Value, ...]]:
+    def _kept_in(self, block: Block) -> dict[str, Kept]:
         """The growing counters that the unit's memory keeps in this block, by all readings that there are."""
         found = {}
         for counter, point in self._keepers:
@@ -202,7 +200,7 @@ class DeviceRecord:
                 at = 2 * (point.address - block.first)
                 words = words_of(block.data[at : at + 2 * point.words])
                 values = (read_words(reading, words) for reading in point.readings)
-                found[counter] = tuple(value for value in values if value is not None)
+                found[counter] = Kept(tuple(value for value in values if value is not None), block.read_at)
         return found
 
     def _without(self, space: Space, first: int, end: int) -> tuple[dict[str, Value], dict[str, str]]:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from gateway.devices.model import Growing, Value
 
@@ -23,21 +24,23 @@ SLACK_UNITS = 1.0
 """Counters are read with a granularity of up to one unit (an hour)."""
 
 
+class Kept(NamedTuple):
+    """A counter in a unit's memory, by several readings, one of which is right, and when it was read."""
+
+    readings: tuple[Value, ...]
+    at: float
+
+
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What is known of a unit. None and missing counters are not compared.
-
-    `at` is when the counters were read, `stored_at` when those in the memory were; of these there may be several
-    readings, one of which is right.
-    """
+    """What is known of a unit. None and missing counters are not compared. `at` is when the counters were read."""
 
     product: str | None = None
     revision: str | None = None
     serial_number: str | None = None
     counters: Mapping[str, Value] = field(default_factory=dict)
     at: float = 0.0
-    stored: Mapping[str, tuple[Value, ...]] = field(default_factory=dict)
-    stored_at: float = 0.0
+    stored: Mapping[str, Kept] = field(default_factory=dict)
 
     @property
     def expects(self) -> bool:
@@ -71,13 +74,12 @@ class Identity:
 
     def _goes_on(self, rule: Growing, seen: Identity) -> bool:
         """Rule 3; what is not stored, or not known to be, has to fit by rule 2."""
-        kept, after = self.stored.get(rule.point, ()), seen.counters.get(rule.point)
-        if not kept or after is None:
+        kept, after = self.stored.get(rule.point), seen.counters.get(rule.point)
+        if kept is None or not kept.readings or after is None:
             return self._misfit(rule, seen) is None
-        if rule.clearable:
-            kept = (*kept, 0)
-        growth = _growth(rule, self.stored_at, seen.at)
-        return any(before <= after <= before + growth for before in kept)
+        readings = (*kept.readings, 0) if rule.clearable else kept.readings
+        growth = _growth(rule, kept.at, seen.at)
+        return any(before <= after <= before + growth for before in readings)
 
     def learned(self, seen: Identity) -> Identity:
         """This identity with what `seen` tells anew."""
@@ -88,8 +90,7 @@ class Identity:
             serial_number=self.serial_number or seen.serial_number,
             counters=seen.counters or self.counters,
             at=seen.at if seen.counters else self.at,
-            stored=seen.stored or self.stored,
-            stored_at=seen.stored_at if seen.stored else self.stored_at,
+            stored={**self.stored, **seen.stored},  # the rest of them may have been refused
         )
 
 

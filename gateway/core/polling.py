@@ -8,8 +8,9 @@ Rule 3: a device is online once each of its live blocks was read since the line 
         and it proved to be the unit that is expected there (identity.py), and while no live block was missed
         three times in a row. It is stale when one was, when it refuses all of them, or when the line is down; offline
         from the moment its breaker opens until it is online again.
-Rule 4: a unit that is not the expected one is not shown and not asked for anybody; it is looked at again
-        every minute, as if it had just come: nothing is kept of what was read of it before.
+Rule 4: a unit that is not the expected one, or says that it is of another model than the configured one, is not shown
+        and not asked for anybody; it is looked at again every minute, as if it had just come: nothing is kept of what
+        was read of it before.
 Rule 5: blocks that the unit's product does not have, by its map, are not asked for once it told its product.
 Rule 6: a value that must be written again and again is warned about after three quarters of its time.
         It is never written by the gateway itself.
@@ -253,11 +254,11 @@ class Polling:
 
     def _stranger(self, record: DeviceRecord) -> bool:
         """Whether what it said by now tells that it is another unit; one of another model may never answer the plan."""
-        return record.known.complaint(record.seen(), record.device.map.identity.growing) is not None
+        return _complaint(record) is not None
 
     def _verify(self, record: DeviceRecord, now: float) -> bool:
         """Rule 4."""
-        complaint = record.known.complaint(record.seen(), record.device.map.identity.growing)
+        complaint = _complaint(record)
         if record.warn(IDENTITY_MISMATCH, on=complaint is not None):
             if complaint is not None:
                 record.device.stats.identity_mismatches += 1
@@ -330,6 +331,15 @@ class Polling:
             request = ReadRequest(function, device.map.identity.serial_first, device.map.identity.serial_words)
             items.append(PollItem(device, Purpose.SERIAL_NUMBER, request.encode(), None, None, now))
         return items
+
+
+def _complaint(record: DeviceRecord) -> str | None:
+    """Why it is another unit than the one that is expected, or of another model than the one whose map is used."""
+    seen, device_map = record.seen(), record.device.map
+    found = None if seen.product is None else map_of_product(seen.product)
+    if found is not None and found.model != device_map.model and device_map is not UNKNOWN:
+        return f"product is {seen.product}, which is no {device_map.model}"
+    return record.known.complaint(seen, device_map.identity.growing)
 
 
 def _shows_life(item: PollItem) -> bool:

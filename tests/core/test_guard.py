@@ -47,6 +47,23 @@ def test_nobody_has_to_wait_for_a_proof_that_is_not_wanted(virtual_line: MakeLin
     assert [isinstance(outcome, bytes) for outcome in outcomes] == [True]
 
 
+@pytest.mark.parametrize("expected", [Identity(), Identity(serial_number=MINE)], ids=["nothing", "a serial number"])
+def test_a_unit_of_another_model_is_not_read_by_the_map_that_is_configured(
+    virtual_line: MakeLine, caplog: pytest.LogCaptureFixture, expected: Identity
+) -> None:
+    """From the start on, when nothing was learnt yet; this one has no serial number where the other model has it."""
+    tristar = SimulatedController(load_map("tristar-mppt"))
+    line = virtual_line(tristar, expected=expected)
+    for _ in range(100):
+        line.run(1.0)
+        assert state(line) is not DeviceState.ONLINE
+    assert mismatch(line)
+    assert f'reason="product is {tristar.plant.product}, which is no prostar-mppt"' in caplog.text
+    swap(line, SimulatedController(MAP, serial_number=MINE))
+    line.run(70.0)
+    assert state(line) is DeviceState.ONLINE
+
+
 class Forgetful(SimulatedController):
     """A unit whose replies to requests that begin with `lost` do not arrive the next `times` times."""
 

@@ -8,13 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.identity import Identity
+from gateway.core.identity import Identity, Kept
 from gateway.devices.model import Growing
 
 HOURS = Growing("hourmeter", 1.0, clearable=False)
 CHARGE = Growing("charge_total", 60.0, clearable=True)
 RULES = (HOURS, CHARGE)
-KEPT = {"hourmeter": (11985,), "charge_total": (4920.0, 322437120.0)}  # half a day ago, read a minute ago
+KEPT = {  # half a day ago, read a minute ago
+    "hourmeter": Kept((11985,), 940.0),
+    "charge_total": Kept((4920.0, 322437120.0), 940.0),
+}
 
 KNOWN = Identity("PS-MPPT-40", "v01.01.13", None, {"hourmeter": 12000, "charge_total": 5000.0}, at=1000.0)
 
@@ -49,17 +52,24 @@ def test_the_same_unit_a_minute_later() -> None:
     ],
 )
 def test_a_unit_that_had_no_power_goes_on_from_what_it_stored(seen: Identity, same: bool) -> None:
-    known = replace(KNOWN, stored=KEPT, stored_at=940.0)
+    known = replace(KNOWN, stored=KEPT)
     assert (known.complaint(seen, RULES) is None) is same
     if not same:
         assert known.complaint(seen, RULES) == KNOWN.complaint(seen, RULES)
 
 
 def test_what_is_not_known_to_be_stored_has_to_fit_as_ever() -> None:
-    known = replace(KNOWN, stored={"hourmeter": (11985,)}, stored_at=940.0)
+    known = replace(KNOWN, stored={"hourmeter": KEPT["hourmeter"]})
     assert known.complaint(later(60, 11985, 5000.0), RULES) is None
     assert known.complaint(later(60, 11985, 4920.0), RULES) is not None
     assert known.learned(Identity(at=9e9)).stored == known.stored
+
+
+def test_what_was_told_of_its_memory_is_known_when_only_a_part_is_told_again() -> None:
+    part = Identity(stored={"charge_total": Kept((4930.0,), 1060.0)})
+    learned = replace(KNOWN, stored=KEPT).learned(part)
+    assert learned.stored == {**KEPT, **part.stored}
+    assert learned.complaint(later(120, 11985, 4930.0), RULES) is None
 
 
 @pytest.mark.parametrize(
@@ -107,7 +117,8 @@ def test_it_is_itself_too_when_it_lost_its_power_whenever_it_stored_last(
     stored_s: float, outage_s: float, written: float, ran: float, sun: float
 ) -> None:
     """What it goes on from was written at some time between our last look at it and the last of its power."""
-    known = replace(KNOWN, stored={"hourmeter": (11990,), "charge_total": (4900.0,)}, stored_at=1000.0 - stored_s)
+    at = 1000.0 - stored_s
+    known = replace(KNOWN, stored={"hourmeter": Kept((11990,), at), "charge_total": Kept((4900.0,), at)})
     hours, ran_h = stored_s / 3600, ran * outage_s / 3600
     meter, charge = 11990 + int(written * hours), 4900 + 60 * written * hours * sun
     assert known.complaint(later(outage_s, meter + int(ran_h), charge + 60 * ran_h * sun), RULES) is None

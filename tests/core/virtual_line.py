@@ -44,6 +44,7 @@ class VirtualLine:
         self.wire = wire
         self.engine = LineEngine(settings, devices, start, Random(1))
         self.sent: list[tuple[float, bytes]] = []
+        self.after_step: Callable[[], None] = lambda: None
 
     def run(self, seconds: float) -> None:
         """Let `seconds` pass."""
@@ -63,6 +64,7 @@ class VirtualLine:
             if data:
                 self.engine.receive(data, self.now)
             self.engine.on_timer(self.now)
+            self.after_step()
 
     def read(
         self, device: Device, pdu: bytes, done: Callable[[Outcome], None], client: str = "", lane: Lane = Lane.CLIENT
