@@ -168,8 +168,9 @@ def test_the_image_is_built_and_runs_as_the_page_says(podman: Podman, line: Path
     config.write_text(config.read_text().replace("nonsense = 1\n", ""))
 
     # It stops in order; what it knows is there for the next one.
-    podman("exec prostar-gateway prostar-gateway backup -c /etc/prostar-gateway/site.toml /tmp/pg.tar")
-    podman("cp prostar-gateway:/tmp/pg.tar backup.tar")
+    archive = "/var/lib/prostar-gateway/pg.tar"  # with Docker nothing else is writable
+    podman(f"exec prostar-gateway prostar-gateway backup -c /etc/prostar-gateway/site.toml {archive}")
+    podman(f"cp prostar-gateway:{archive} backup.tar")
     assert "history.sqlite3" in podman.sh("tar -tf backup.tar", tmp_path).stdout
     podman("stop prostar-gateway")
     assert podman("inspect --format '{{.State.ExitCode}}' prostar-gateway") == "0"
