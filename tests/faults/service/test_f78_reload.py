@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import os
 import re
 import signal
@@ -21,7 +22,7 @@ from gateway.devices.schema import load_map
 from tests.e2e.programs import alive, environment
 from tests.faces.modbus.tls.conftest import pki
 from tests.faces.modbus.tls.site import Pki
-from tests.faults.service.rig import NotifySocket, Service, client, descriptors
+from tests.faults.service.rig import NotifySocket, Service, client, descriptors, read
 from tests.machine import Bystander
 
 __all__ = ["pki"]
@@ -148,6 +149,66 @@ async def test_what_did_not_change_does_not_notice(service: Service) -> None:
     assert await port_of(service, "shelter-a") == port
     assert opens.findall((await service.get("/metrics"))[1]) == ["1.0"]
     assert await service.end() == 0
+
+
+class Watcher:
+    """A client that notes whose words it is given, and which configurations may have been in use meanwhile."""
+
+    def __init__(self, unit_id: int) -> None:
+        self.unit_id = unit_id
+        self.steps = 0  # even: the configuration of this half is in use; odd: the next one is coming
+        self.given: list[tuple[range, bytes]] = []
+
+    async def run(self, port: int) -> None:
+        """Read until cancelled."""
+        async with client(port) as asker:
+            while True:
+                asked = self.steps
+                reply = await asker.read(self.unit_id)
+                assert reply, "every request is answered"
+                if reply[0] < 0x80:
+                    self.given.append((range(asked // 2, (self.steps + 1) // 2 + 1), reply[2:]))
+                await asyncio.sleep(0.002)
+
+
+async def test_unit_ids_that_are_swapped_are_never_mixed(service: Service) -> None:
+    """And the lines with them, so that each has another index: not one request is answered by the other controller."""
+    service.plug("shelter-b", 1)
+    sites: list[Devices] = [(A1, B3), ((*B3[:3], 11), (*A1[:3], 13)), ((*A1[:3], 13), (*B3[:3], 11)), (B3,)]
+    units = {line: found[0] for line, found in service.units.items()}
+    words = {line: unit.word(0x12).to_bytes(2) + unit.word(0x13).to_bytes(2) for line, unit in units.items()}
+    wanted = [{unit_id: words[line] for line, _, _, unit_id in site} for site in sites]
+    configure(service, *sites[0])
+    service.start()
+    await service.online()
+    watchers = [Watcher(11), Watcher(13)]
+    tasks = [asyncio.create_task(watcher.run(service.modbus)) for watcher in watchers]
+    for number, site in enumerate(sites[1:], 1):
+        configure(service, *site)
+        for watcher in watchers:
+            watcher.steps += 1
+        assert "event=reloaded" in await reload(service)
+        for watcher in watchers:
+            watcher.steps += 1
+        await service.online()
+        async with client(service.modbus) as asker:
+            for unit_id, expected in wanted[number].items():
+                assert await asker.read(unit_id) == b"\x03\x04" + expected
+        text = (await service.get("/metrics"))[1]
+        shown = re.findall(r'^morningstar_up\{device="(.*?)",line="(.*?)",.*unit_id="(\d+)"\} 1.0$', text, re.MULTILINE)
+        assert sorted(shown) == sorted((name, line, str(unit_id)) for line, name, _, unit_id in site)
+        lines = list(dict.fromkeys(line for line, *_ in site))
+        conditions = json.loads((await service.get("/api/v1/conditions?state=all"))[1])["conditions"]
+        assert [each["line"] for each in conditions if each["condition"] == "line_down"] == lines
+    for watcher, task in zip(watchers, tasks, strict=True):
+        assert not task.done()
+        task.cancel()
+        for configurations, given in watcher.given:
+            assert any(wanted[number].get(watcher.unit_id) == given for number in configurations)
+    await asyncio.gather(*tasks, return_exceptions=True)
+    assert len(watchers[0].given) > 20
+    assert await service.end() == 0
+    assert "task_failed" not in service.programs[-1].log() + "".join(service.programs[-1].seen)
 
 
 async def test_another_port_another_address_another_device(service: Service) -> None:
@@ -406,3 +467,27 @@ async def test_stopping_in_the_middle_of_a_reload(service: Service) -> None:
     os.sched_yield()
     assert await service.end() == 0
     assert "Traceback" not in program.log()
+
+
+async def test_stopping_while_a_line_that_goes_has_a_request_on_the_wire(service: Service) -> None:
+    """The reload waits for the line, and the stop for both: who asked is answered, and the log ends as it should."""
+    service.plug("shelter-b", 1)
+    service.configure((A1, B3), line_keys="baudrate = 115200\nreply_timeout_s = 2.0\nretries = 0")
+    program = service.start()
+    await service.online()
+    (unit,) = service.units["shelter-b"]
+    await unit.is_quiet()
+    unit.never_answered = read()
+    async with client(service.modbus) as asker:
+        asker.ask(13, read())
+        await unit.is_asked(read())
+        service.configure((A1,))
+        program.process.send_signal(signal.SIGHUP)
+        while 'device="array-3"' in (await service.get("/metrics"))[1]:  # noqa: ASYNC110 - another process
+            await asyncio.sleep(0.01)
+        assert await service.end() == 0
+        assert await asker.reply() in {b"\x83\x06", b"\x83\x0b"}
+    log = program.log()
+    assert log.endswith("event=stopped status=0")
+    assert "event=reload_refused" not in log
+    assert "Traceback" not in log
