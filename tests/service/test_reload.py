@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import socket
 import sys
 import weakref
 from collections.abc import AsyncIterator
@@ -15,7 +16,7 @@ import pytest
 
 from gateway.clock import SystemClock
 from gateway.core.snapshot import DeviceState
-from gateway.errors import ConfigError
+from gateway.errors import ConfigError, ListenError
 from gateway.faces.snmp.agent import SnmpAgent
 from gateway.history.keeper import HistoryKeeper
 from gateway.lines.factory import Line
@@ -226,6 +227,29 @@ async def test_what_is_known_of_a_daily_log_is_never_shown_of_another_device(sit
         assert kept.harvests == 3
         await change(gateway, site.config(B.replace("12", "13"), FACES))
         assert list(gateway._history.devices) == [13]
+
+
+async def test_a_port_that_opens_late_brings_in_no_secret_that_was_not_taken(site: Site) -> None:
+    """A token was changed, and the reload was refused for something else: the one in use holds on all ports alike."""
+    token = site.folder / "token"
+    token.write_text("0123456789abcdef")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        ports = f'["127.0.0.1:0", "127.0.0.1:{taken.getsockname()[1]}"]'
+        http = f'[http]\nlisten = {ports}\nbearer_token_file = "{token}"\n'
+        gateway = Gateway(site.config(A, http), SystemClock())
+        first, second = gateway._http.listeners
+        with pytest.raises(ListenError):
+            await second.start()
+        await first.start()
+        access = gateway._http.access
+        token.write_text("fedcba9876543210")
+    await second.start()
+    assert gateway._http.access is access
+    await first.stop()
+    await second.stop()
+    await first.start()
+    assert gateway._http.access is not access
+    await first.stop()
 
 
 async def test_an_engine_that_starts_while_another_agent_is_made_starts_once(site: Site) -> None:

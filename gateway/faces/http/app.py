@@ -132,8 +132,12 @@ class HttpFace:
         return tuple(present.get(listener.key, listener) for listener in wanted)
 
     def _open(self) -> Handler:
-        """What answers requests, with the credentials that the files hold now; ListenError when they hold none."""
-        self._access = Access.read(self._settings)
+        """What answers requests, with the credentials that the files hold now; ListenError when they hold none.
+
+        While another port is open those in use hold: it is a reload that brings in others.
+        """
+        if not any(listener.bound for listener in self.listeners):
+            self._access = Access.read(self._settings)
         return guard(self._answer, lambda: self._access, self._count_refused)
 
     async def _answer(self, request: Request) -> Reply | None:
