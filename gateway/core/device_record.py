@@ -165,6 +165,7 @@ class DeviceRecord:
     def is_of(self, device_map: DeviceMap) -> None:
         """The device, whose model was to be found, is of this one."""
         self.device.map = device_map
+        self.verified = self.verified and not self.known.expects  # it can be asked for its serial number only now
         self._decoder = _decoder(self.device)
         self._keepers = _keepers(device_map)
 

@@ -6,8 +6,8 @@ Rule 2: a block refused with exception 02 or 03 is split in two, and the split i
         asked again every ten minutes; when it is there after all, everything is planned anew.
 Rule 3: a device is online once each of its live blocks was read since the line was opened or the device came back
         and it proved to be the unit that is expected there (identity.py), and while no live block was missed
-        three times in a row. It is stale when one was, when it refuses all of them, or when the line is down; offline
-        from the moment its breaker opens until it is online again.
+        three times in a row. It is stale when one was, when it refuses all of them, when it still has to prove who it
+        is, or when the line is down; offline from the moment its breaker opens until it is online again.
 Rule 4: a unit that is not the expected one, or says that it is of another model than the configured one, is not shown
         and not asked for anybody; it is looked at again every minute, as if it had just come: nothing is kept of what
         was read of it before.
@@ -226,7 +226,7 @@ class Polling:
             return DeviceState.OFFLINE
         complete = bool(live) and all(item.fresh and item.misses == 0 for item in live)
         if record.state is DeviceState.ONLINE:
-            if not live or any(item.misses >= MISSES_TO_OPEN for item in live):
+            if not record.verified or not live or any(item.misses >= MISSES_TO_OPEN for item in live):
                 return DeviceState.STALE
             if complete:
                 record.known = record.known.learned(record.seen())

@@ -41,6 +41,21 @@ class Stranger(SimulatedController):
         return super().handle(pdu, now)
 
 
+class LateTriStar(SimulatedController):
+    """One that fails to say what it is the first two times."""
+
+    failures = 2
+
+    def __init__(self) -> None:
+        super().__init__(TRISTAR, plant=TS_60, serial_number="16470000")
+
+    def handle(self, pdu: bytes, now: float) -> bytes | None:
+        if pdu[0] == 0x2B and self.failures:
+            self.failures -= 1
+            return exception_reply(0x2B, 4)
+        return super().handle(pdu, now)
+
+
 def auto_line(
     *stations: Station, decode: Mapping[str, str] | None = None, expected: Identity | None = None
 ) -> VirtualLine:
@@ -202,6 +217,24 @@ def test_a_unit_that_is_not_the_configured_product_does_not_become_its_model() -
     assert device.map is UNKNOWN
     assert IDENTITY_MISMATCH in device.snapshot.warnings
     assert device.snapshot.state is not DeviceState.ONLINE
+
+
+@pytest.mark.parametrize("number", ["16470000", "16470001"], ids=["its own", "another"])
+def test_one_that_could_not_say_what_it_is_still_has_to_tell_the_configured_serial_number(number: str) -> None:
+    """As long as its model is not known it cannot be asked for one, and is served raw."""
+    line = auto_line(LateTriStar(), expected=Identity(serial_number=number))
+    (device,) = line.devices
+    line.run(3.0)
+    assert device.snapshot.warnings == {UNKNOWN_MODEL}
+    assert device.snapshot.state is DeviceState.ONLINE
+    for _ in range(400):
+        line.run(0.1)
+        assert not device.snapshot.shown() or device.snapshot.serial_number == number
+    is_mine = number == "16470000"
+    assert device.map is TRISTAR
+    assert (device.snapshot.state is DeviceState.ONLINE) is is_mine
+    assert (IDENTITY_MISMATCH in device.snapshot.warnings) is not is_mine
+    assert isinstance(line.ask(device, BATTERY_REGULATION), bytes if is_mine else IdentityUnproven)
 
 
 def test_readings_of_either_model_may_be_chosen_and_those_that_it_has_are_taken() -> None:
