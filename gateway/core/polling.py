@@ -1,7 +1,7 @@
 """What is polled of a device, and what the replies say about its state.
 
-Rule 1: live blocks as often as asked (at night more seldom, where configured), settings seldom; who the device is
-        once after each start. The line decides what is possible (scheduler.py).
+Rule 1: live blocks as often as asked (at night more seldom, where configured), settings seldom, but again soon where
+        they did not come; who the device is once after each start. The line decides what is possible (scheduler.py).
 Rule 2: a block refused with exception 02 or 03 is split in two, and the split is remembered. What cannot be split is
         asked again every ten minutes; when it is there after all, everything is planned anew.
 Rule 3: a device is online once each of its live blocks was read since the line was opened or the device came back
@@ -46,6 +46,8 @@ LOOK_AGAIN_S = 60.0
 REFUSED_AGAIN_S = 600.0
 ASK_AGAIN_S = 5.0
 """How often a device of no known model is asked who it is."""
+SOON_S = 5.0
+"""Settings that did not come are asked for after twice that, then after twice as long each time."""
 
 REWRITE_WARNING_SHARE = 0.75
 _LATER = (0x05, 0x06)  # acknowledged, busy: no answer yet
@@ -176,7 +178,10 @@ class Polling:
             return
         item.misses += 1
         item.device.stats.failures += 1
-        if code not in _REFUSALS_TO_SPLIT or item.period_s is None or item.refused or item not in record.polls.items:
+        if code not in _REFUSALS_TO_SPLIT:
+            _soon(item, now)
+            return
+        if item.period_s is None or item.refused or item not in record.polls.items:
             return
         record.polls.refused(block.space, block.count)
         record.forget(block.space, block.first, block.last + 1)
@@ -204,6 +209,7 @@ class Polling:
         """A poll brought nothing."""
         item.misses += 1
         if item.period_s is not None:
+            _soon(item, now)
             return
         item.due = now + self._settings.poll.live_s
         if _is_expected(item, record):
@@ -347,6 +353,12 @@ def _shows_life(item: PollItem) -> bool:
     if item.block is None:
         return item.purpose is Purpose.IDENTIFY and item.period_s is not None
     return item.block.poll is PollClass.LIVE and not item.refused
+
+
+def _soon(item: PollItem, now: float) -> None:
+    """Settings did not come (rule 1): one lost reply at the start must not hide them for their whole period."""
+    if item.block is not None and item.block.poll is PollClass.SETTINGS and not item.refused:
+        item.due = min(item.due, now + SOON_S * 2 ** min(item.misses, 10))
 
 
 def _is_expected(item: PollItem, record: DeviceRecord) -> bool:

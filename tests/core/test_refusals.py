@@ -9,6 +9,7 @@ import pytest
 from gateway.core.settings import PollSettings
 from gateway.core.snapshot import DeviceState
 from tests.core.test_engine import Registers, registers, state
+from tests.core.test_guard import MANY, forgetful
 from tests.core.virtual_line import MakeLine, VirtualLine
 
 SELDOM = PollSettings(live_s=5.0, settings_s=300.0)
@@ -103,3 +104,22 @@ def test_how_often_live_values_are_refreshed_is_told_of_those_that_are_read(virt
     refresh_s = line.devices[0].stats.refresh_s
     assert refresh_s is not None
     assert refresh_s < 2.0
+
+
+SETTINGS = b"\x03\xe0\x00"
+
+
+@pytest.mark.parametrize("code", [0, 0x04, 0x06], ids=["lost", "04", "06"])
+def test_settings_that_did_not_come_are_asked_for_again_soon(virtual_line: MakeLine, code: int) -> None:
+    line = virtual_line(forgetful(SETTINGS, 2, code))
+    line.run(5.0)
+    assert state(line) is DeviceState.ONLINE
+    assert 0xE000 not in addresses(line)
+    line.run(35.0)
+    assert 0xE000 in addresses(line)
+
+
+def test_settings_that_never_come_cost_the_line_little(virtual_line: MakeLine) -> None:
+    line = virtual_line(forgetful(SETTINGS, MANY, 0x04))
+    line.run(3600.0)
+    assert 12 <= sum(frame[1:].startswith(SETTINGS) for _, frame in line.sent) <= 20
