@@ -72,6 +72,11 @@ class Announcer:
                 if told is not None:
                     self._waiting.setdefault(place, max(now, told.at + self._hold_s))
 
+    def adjust(self, *, hold_s: float, least: Severity) -> None:
+        """Go on by these; what was told stays told."""
+        self._hold_s = hold_s
+        self._least = least
+
     def go_on(self, conditions: Conditions) -> None:
         """There are these conditions from now on (rule 6); what changes with them follows by `changed`."""
         before, self._told = self._told, {}

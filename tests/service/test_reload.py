@@ -18,6 +18,7 @@ from gateway.clock import SystemClock
 from gateway.core.snapshot import DeviceState
 from gateway.errors import ConfigError, ListenError
 from gateway.faces.snmp.agent import SnmpAgent
+from gateway.faces.snmp.secret import Secret
 from gateway.history.keeper import HistoryKeeper
 from gateway.lines.factory import Line
 from gateway.service.config import Config, parse_config
@@ -300,6 +301,28 @@ async def test_a_receiver_that_stays_is_told_what_was_left_and_a_new_one_what_is
         assert new is not post
         await change(gateway, site.config(A, B, FACES, COMMUNITY))
         assert gateway._snmp.notifier not in gateway.keepers
+
+
+async def test_a_receiver_with_another_secret_is_the_same_and_is_told_what_is_clear_by_now(site: Site) -> None:
+    async with running(site.config(A, FACES, COMMUNITY, site.receiver(9))) as gateway:
+        (post,) = gateway._snmp.notifier._posts
+        stats = post.delivery.stats
+        known = post.delivery._announcer._told
+        device = gateway.site.by_unit[11]
+        device.snapshot = replace(device.snapshot, state=DeviceState.OFFLINE)
+        gateway._watching.look()
+        assert (11, 401) in known
+        secret = site.receiver(9, "secret-2").replace("[[snmp.notify]]", "[[snmp.notify]]\nper_minute = 7")
+        await change(gateway, site.config(A, FACES, COMMUNITY, secret))
+        assert gateway._snmp.notifier._posts == [post]
+        assert post.receiver.per_minute == 7
+        assert post.receiver.community == Secret(b"secret-2")
+        assert gateway._snmp.notifier.stats == (stats,)
+        assert gateway._snmp.notifier in gateway.keepers
+        assert (11, 401) in post.delivery._announcer._told
+        informs = secret.replace('"trap"', '"inform"')
+        await change(gateway, site.config(A, FACES, COMMUNITY, informs))
+        assert post not in gateway._snmp.notifier._posts
 
 
 async def test_a_receiver_that_was_told_of_a_device_is_told_of_it_when_its_line_is_a_new_one(site: Site) -> None:

@@ -67,8 +67,7 @@ class Delivery:
         self._inform = receiver.inform
         self._writer = writer
         self._announcer = Announcer(hold_s=receiver.hold_s, least=receiver.least)
-        self._interval_s = 60.0 / receiver.per_minute
-        self._bucket = Bucket(receiver.per_minute / 60.0, _BURST_S, now)
+        self._limit(receiver, now)
         self._standard: dict[Oid, None] = {notifications.COLD_START: None} if cold else {}
         self._under_way: dict[int, Note] = {}
         self._sequence = 0
@@ -86,6 +85,15 @@ class Delivery:
     def changed(self, watches: Iterable[Watch], now: float) -> None:
         """The state of these conditions changed."""
         self._announcer.changed(watches, now)
+
+    def adjust(self, receiver: Receiver, now: float) -> None:
+        """Go on by other settings; what the receiver was told, and what it is still to be told, stays."""
+        self._announcer.adjust(hold_s=receiver.hold_s, least=receiver.least)
+        self._limit(receiver, now)
+
+    def _limit(self, receiver: Receiver, now: float) -> None:
+        self._interval_s = 60.0 / receiver.per_minute
+        self._bucket = Bucket(receiver.per_minute / 60.0, _BURST_S, now)
 
     def go_on(self, conditions: Conditions) -> None:
         """There are these conditions from now on; what is under way about others goes on until it is acknowledged."""

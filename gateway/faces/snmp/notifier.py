@@ -48,15 +48,24 @@ class Notifier:
         ticks: Callable[[float], int],
         before: Notifier | None = None,
     ) -> None:
-        """With `before`, which must have ended by the time that this one runs, its receivers are told what is left."""
+        """With `before`, which must have ended by the time that this one runs, its receivers are told what is left.
+
+        A receiver that only has another secret, rate or the like is the same one: it is not told all anew.
+        """
         self._clock = clock
         self._engine = engine
         now = clock.monotonic()
         known = {} if before is None else {post.receiver: post for post in before._posts}  # noqa: SLF001 - its own kind
+        others = {post.place: post for receiver, post in known.items() if receiver not in receivers}
         self._posts: list[_Post] = []
         for receiver in receivers:
             if receiver in known:
                 self._posts.append(known[receiver])
+                continue
+            same = others.pop((receiver.label, receiver.inform), None)
+            if same is not None:
+                same.adjust(receiver, now)
+                self._posts.append(same)
                 continue
             stats = NotifyStats(receiver.label, "inform" if receiver.inform else "trap")
             writer = PduWriter(layout, site, ticks, inform=receiver.inform)
@@ -117,6 +126,16 @@ class _Post:
         self._clock = clock
         self._throttle = Throttle()
         self._was_silent = False
+
+    @property
+    def place(self) -> tuple[str, bool]:
+        """Where it is, and whether it is told by informs."""
+        return self.receiver.label, self.receiver.inform
+
+    def adjust(self, receiver: Receiver, now: float) -> None:
+        """Go on by other settings of the same place; `run` is given their channel."""
+        self.receiver = receiver
+        self.delivery.adjust(receiver, now)
 
     async def run(self, channel: Channel) -> None:
         """Send until cancelled."""
