@@ -65,12 +65,17 @@ class Serving:
 
     def __init__(self, device: Device, *, max_age_s: float, strict_map: bool) -> None:
         self.device = device
+        self.map = device.map
         self.functions = device.map.functions  # those of an unknown model are those of every model
-        self._max_age_s = max_age_s
-        self._strict_map = strict_map and device.map is not UNKNOWN  # what its ranges are, it knows alone
         self._known = {space: covered(device.map.extents, space) for space in Space}
         self._client_blocks: deque[Block] = deque(maxlen=CLIENT_BLOCKS)
         self._blocks_of: tuple[DeviceState, float] | None = None  # the stretch of being online they belong to
+        self.adjust(max_age_s=max_age_s, strict_map=strict_map)
+
+    def adjust(self, *, max_age_s: float, strict_map: bool) -> None:
+        """Go on by other settings; what was read for clients stays, and a write under way forgets its part of it."""
+        self._max_age_s = max_age_s
+        self._strict_map = strict_map and self.map is not UNKNOWN  # what its ranges are, it knows alone
 
     def answer(self, pdu: bytes, now: float) -> Answer:
         """Answer a request that the policy allows; raises the RequestError that refuses it."""

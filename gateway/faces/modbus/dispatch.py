@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -104,20 +104,22 @@ Waiting = Forward | WriteOrder
 
 
 class Routes:
-    """Which device a unit id stands for. What is remembered of a device is shared by every way to it."""
+    """Which device a unit id stands for. What is remembered of a device is shared by every way to it.
 
-    def __init__(self, settings: ModbusSettings, site: Site) -> None:
-        self._serving = [
-            Serving(device, max_age_s=settings.max_age_s, strict_map=settings.strict_map) for device in site.devices
-        ]
+    It outlives a change of the configuration as long as the device is the same, of the same model.
+    """
+
+    def __init__(self, settings: ModbusSettings, site: Site, before: Routes | None = None) -> None:
+        known = {} if before is None else {serving.device: serving for serving in before.all}
+        self.all: Sequence[Serving] = [_serving(settings, device, known.get(device)) for device in site.devices]
 
     def by_unit(self) -> Mapping[int, Serving]:
         """The configured unit ids."""
-        return _usable({serving.device.unit_id: serving for serving in self._serving})
+        return _usable({serving.device.unit_id: serving for serving in self.all})
 
     def of_line(self, name: str) -> Mapping[int, Serving]:
         """The devices of one line by their addresses there: what a port that stands for this line serves."""
-        return _usable({s.device.address: s for s in self._serving if s.device.line.name == name})
+        return _usable({s.device.address: s for s in self.all if s.device.line.name == name})
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,6 +267,13 @@ class Dispatcher:
 
 
 _requester = lru_cache(maxsize=256)(Requester)
+
+
+def _serving(settings: ModbusSettings, device: Device, before: Serving | None) -> Serving:
+    if before is None or before.map is not device.map:
+        return Serving(device, max_age_s=settings.max_age_s, strict_map=settings.strict_map)
+    before.adjust(max_age_s=settings.max_age_s, strict_map=settings.strict_map)
+    return before
 
 
 def _usable(routes: Mapping[int, Serving]) -> Mapping[int, Serving]:

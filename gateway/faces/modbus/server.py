@@ -163,6 +163,7 @@ class ModbusServer:
         self.dispatcher = Dispatcher({}, clock, self._shared)
         self._barred = Dispatcher({}, clock, self._shared, barred=True)
         self._of_line: Mapping[str, Dispatcher] = {}
+        self._routes: Routes | None = None
         self._route(settings, site)
         if settings.tls is not None:
             self.door = self._new_door(settings.tls)
@@ -215,7 +216,7 @@ class ModbusServer:
         return Shared(self.stats, self._audit, limiter, self.writer)
 
     def _route(self, settings: ModbusSettings, site: Site) -> None:
-        routes = Routes(settings, site)
+        self._routes = routes = Routes(settings, site, self._routes)
         own = None
         if settings.status_unit:
             own = StatusRegisters(site, self.stats, started_at=self._started_at, version=__version__)

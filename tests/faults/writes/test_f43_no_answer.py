@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -43,6 +44,27 @@ async def test_what_clients_had_read_is_not_served_any_more(tmp_path: Path) -> N
         assert await it.query("06 e000 4b64") == "860b"
         assert await it.query("03 e000 0002") == f"03044b64{before[8:]}"
         assert len(it.line.writes) == 1
+
+
+@pytest.mark.parametrize("max_age_s", [5.0, 60.0], ids=["as before", "another age"])
+async def test_nor_is_what_they_read_between_a_reload_and_the_write(tmp_path: Path, max_age_s: float) -> None:
+    async with writing(tmp_path) as it:
+        await it.connect()
+        it.line.held = True
+        it.ask("06 e000 4b64")
+        await it.until(lambda: it.line.waiting)
+        while not it.line.waiting[0].write:
+            it.line.release()
+            await it.until(lambda: it.line.waiting)
+        it.server.adjust(replace(it.server.settings, max_age_s=max_age_s), it.site, None)
+        it.ask("03 e000 0001", client=1)
+        await it.until(lambda: len(it.line.waiting) == 2)
+        it.line.waiting.rotate()  # the read goes out first, for the write still had to be put down
+        it.line.held = False
+        it.line.release()
+        assert await it.answer(client=1) != "03024b64"
+        assert await it.answer() == "06e0004b64"
+        assert await it.query("03 e000 0001", client=1) == "03024b64"
 
 
 async def test_the_rest_of_the_request_is_not_sent(tmp_path: Path) -> None:
