@@ -106,11 +106,11 @@ def test_bad_pass_phrases_are_refused_and_not_shown(folder: Path, key: str, cont
     assert "seven77" not in problem
 
 
-def test_check_config_exits_78_for_a_short_pass_phrase(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_config_exits_78_for_a_short_pass_phrase(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
     (folder / "auth").write_text("hunter2")
     (folder / "c.toml").write_text(user(folder))
     assert run("check-config", "-c", str(folder / "c.toml")) == 78
-    said = capsys.readouterr()
+    said = capfd.readouterr()
     assert "snmp.user[0].auth_password_file" in said.err
     assert "RFC 3414 §11.2" in said.err
     assert "hunter2" not in said.out + said.err
@@ -121,7 +121,7 @@ def test_check_config_exits_78_for_a_short_pass_phrase(folder: Path, capsys: pyt
     [("snmp.user[0]", "[[snmp.user]]"), ("modbus.tls", "[modbus.tls]")],
 )
 def test_without_the_library_that_encrypts_it_is_refused(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], key: str, table: str
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], key: str, table: str
 ) -> None:
     text = user(folder)
     if table not in text:
@@ -133,21 +133,21 @@ def test_without_the_library_that_encrypts_it_is_refused(
     monkeypatch.syspath_prepend(folder)  # where the process that reads for `run` finds that
     for command in ("check-config", "run"):
         assert run(command, "-c", str(folder / "c.toml")) == 78
-        assert f"{key}: needs the Python package cryptography, which is not installed" in capsys.readouterr().err
+        assert f"{key}: needs the Python package cryptography, which is not installed" in capfd.readouterr().err
 
 
 def test_a_missing_pass_phrase_is_advice_when_checked_and_stops_the_start(
-    folder: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "priv").unlink()
     (folder / "auth").chmod(0o644)
     (folder / "c.toml").write_text(user(folder))
     assert run("check-config", "-c", str(folder / "c.toml")) == 0
-    shown = capsys.readouterr().out
+    shown = capfd.readouterr().out
     assert f"snmp.user[0].priv_password_file: {folder}/priv cannot be read: No such file" in shown
     assert f"snmp.user[0].auth_password_file: {folder}/auth is open to every user of this machine (mode 644)" in shown
     assert run("run", "-c", str(folder / "c.toml")) == 78
-    assert "snmp.user[0].priv_password_file" in capsys.readouterr().err
+    assert "snmp.user[0].priv_password_file" in capfd.readouterr().err
     with pytest.raises(ConfigError, match=r"snmp\.user\[0\]\.priv_password_file: .*priv cannot be read"):
         snmp_settings(load_config(folder / "c.toml"))
 
