@@ -88,13 +88,14 @@ def entities(gateway: Gateway, *, sensors_only: bool = False) -> Rows:
     """The physical entities: the gateway, then each device followed by its sensors; or the sensors alone."""
     devices = gateway.site.devices
     order = {device.unit_id: place for place, device in enumerate(devices, start=1)}
-    measured = {id(each): sensors(each) for each in {id(device.map): device.map for device in devices}.values()}
+    # What a device measures is that of its map now, even if another one is found for it later, or while this is made.
+    maps = {device.unit_id: device.map for device in devices}
+    measured = {id(each): sensors(each) for each in {id(each): each for each in maps.values()}.values()}
     by_column = {
         key: {_column(point): (position, point) for position, point in enumerate(points, start=1)}
         for key, points in measured.items()
     }
-    # What a device measures is that of its map now, even if another one is found for it later.
-    of_unit = {device.unit_id: (device, by_column[id(device.map)]) for device in devices}
+    of_unit = {device.unit_id: (device, by_column[id(maps[device.unit_id])]) for device in devices}
 
     def row(unit: int, column: int) -> EntityRow:
         if not unit:
@@ -112,7 +113,7 @@ def entities(gateway: Gateway, *, sensors_only: bool = False) -> Rows:
         numbers += [unit * INDEXES_A_DEVICE + column for column in columns]
 
     def model(unit: int) -> int:
-        return id(of_unit[unit][0].map) if unit else 0
+        return id(maps[unit]) if unit else 0
 
     return NumberedRows(numbers, INDEXES_A_DEVICE, row, lambda unit: of_unit[unit][0] if unit else None, model)
 

@@ -10,8 +10,9 @@ import pytest
 
 from gateway.core.site import Device, Site
 from gateway.core.snapshot import Block, DeviceState
-from gateway.devices.model import DeviceMap, Identification, MibColumn, Space
+from gateway.devices.model import DeviceMap, Identification, MibColumn, Point, Space
 from gateway.devices.schema import load_map, models
+from gateway.devices.unknown import UNKNOWN
 from gateway.errors import MapError
 from gateway.faces.snmp import entity
 from gateway.faces.snmp.agent import SnmpAgent
@@ -185,6 +186,27 @@ def test_another_device_moves_no_index(agent: SnmpAgent, site: Site, device_map:
         index: (row.device, row.point) for index, row in before.items()
     }
     assert {index // 1000 for index in after.keys() - before.keys()} == {5}
+
+
+def test_a_model_that_is_found_while_the_rows_are_made_is_for_the_next_to_be_made(
+    agent: SnmpAgent, site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are made in a thread, beside the lines."""
+    gateway = next(slot for slot in agent.tree).row
+    assert isinstance(gateway, Gateway)
+    device, sensors = site.devices[0], entity.sensors
+    device.map = UNKNOWN
+    gateway = replace(gateway, site=Site.of("small", site.lines, [device]))
+
+    def found_meanwhile(device_map: DeviceMap) -> list[Point]:
+        device.map = load_map("tristar-mppt")
+        return sensors(device_map)
+
+    monkeypatch.setattr(entity, "sensors", found_meanwhile)
+    rows = entity.entities(gateway, sensors_only=True)
+    assert device not in rows.devices(0, rows.size)
+    rows = entity.entities(gateway, sensors_only=True)
+    assert device in rows.devices(0, rows.size)
 
 
 async def discovered(ask: Ask) -> dict[str, librenms.Sensor]:
