@@ -64,6 +64,7 @@ CAUSES: dict[str, Cause] = {
     "lost 4": lambda rig: rig.spoilt.next(TARGET, *["lost"] * 4),
     "late": lambda rig: rig.spoilt.next(TARGET, "late"),
     "late 3": lambda rig: rig.spoilt.next(TARGET, *["late"] * 3),
+    "very late": lambda rig: rig.spoilt.next(TARGET, "very late"),
     "corrupt": lambda rig: rig.spoilt.next(TARGET, "corrupt"),
     "foreign": lambda rig: rig.spoilt.next(TARGET, "foreign"),
     "answers 02": _answers(0x02),

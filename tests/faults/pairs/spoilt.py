@@ -11,7 +11,7 @@ from gateway.modbus.mbap import Adu
 from gateway.simulator.medium import Burst
 from gateway.simulator.upstream import Piece
 
-LATE_S = 0.9
+LATE_S = {"late": 0.9, "very late": 3.0}
 STRANGER = 0xC8
 
 
@@ -49,7 +49,7 @@ class Spoilt:
     def _serial_reply(self, frame: bytes, starts_at: float) -> Sequence[Burst]:
         address = frame[0]
         fate = self._fate(address)
-        at = max(starts_at + LATE_S * (fate == "late"), self._free_at.get(address, starts_at))
+        at = max(starts_at + LATE_S.get(fate, 0.0), self._free_at.get(address, starts_at))
         self._free_at[address] = at
         if fate == "lost":
             return ()
@@ -63,8 +63,7 @@ class Spoilt:
         fate = self._fate(request.unit)
         if fate == "lost":
             return ()
-        if fate == "late":
-            at += LATE_S
+        at += LATE_S.get(fate, 0.0)
         if fate == "corrupt":
             return (Piece(at, reply[: len(reply) // 2]),)
         if fate == "foreign":

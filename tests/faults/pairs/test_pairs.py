@@ -7,7 +7,7 @@ What must hold is in rig.py. A tier takes those moments in turn, so that all pai
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from itertools import cycle
+from itertools import cycle, product
 
 import pytest
 from hypothesis import given, settings
@@ -26,8 +26,12 @@ KINDS = [
 ]
 
 
-def try_pair(first: str, second: str, phase: str, gap: str, *, upstream: bool) -> None:
-    rig = PairRig(upstream=upstream)
+STARTS = {"restart", "taken away", "added", "serial number of another unit"}
+"""After these a unit is only told from another one by what is configured of it."""
+
+
+def try_pair(first: str, second: str, phase: str, gap: str, *, upstream: bool, configured: bool = True) -> None:
+    rig = PairRig(upstream=upstream, configured=configured)
     rig.run(6.0)
     causes = UPSTREAM_CAUSES
     steps = ((phase, PHASES[phase]), (first, causes[first]), (gap, GAPS[gap]), (second, causes[second]))
@@ -75,6 +79,16 @@ def test_every_pair_at_every_phase(upstream: bool, first: str) -> None:
         when = list(zip(range(len(PHASES)), moments(number), strict=False))
         for _, (phase, gap) in when[:1] if LONG_TO_MEND in {first, second} else when:
             try_pair(first, second, phase, gap, upstream=upstream)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("upstream", [False, True], ids=["serial", "upstream"])
+def test_every_pair_where_a_unit_is_known_by_what_it_told_before(upstream: bool) -> None:
+    causes: Mapping[str, Cause] = UPSTREAM_CAUSES if upstream else CAUSES
+    pairs = product(causes.keys() - STARTS - {LONG_TO_MEND}, repeat=2)
+    for (first, second), (phase, gap) in zip(sorted(pairs), moments(0), strict=False):
+        if phase not in STARTS:
+            try_pair(first, second, phase, gap, upstream=upstream, configured=False)
 
 
 STEPS = st.lists(
