@@ -1,4 +1,4 @@
-"""Reading what is stored, beside a gateway that goes on writing. Synchronous.
+"""Reading what is stored, beside a gateway that goes on writing. Synchronous; a reader shows one moment of it.
 
 Days come by device, controller and hourmeter. Of one controller the times given out rise strictly, although each is
 an estimate: where two would not, the later day is put a second after the earlier one.
@@ -67,6 +67,7 @@ class HistoryReader:
         self._behind = behind or {}
         self._path = directory / FILE_NAME
         self._db = open_for_reading(directory)
+        self._db.execute("BEGIN")  # the first look at the file is the moment
 
     def close(self) -> None:
         """Close the file."""

@@ -7,7 +7,8 @@ import json
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import aclosing
+from contextlib import aclosing, closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,10 +21,12 @@ from gateway.errors import HistoryError
 from gateway.faces.http.devices import DEVICE_LABELS
 from gateway.history.dates import HOUR_S
 from gateway.history.export import PIECE, export, rows_to_read
+from gateway.history.identity import Place
 from gateway.history.openmetrics import LABELS, daily_metrics
 from gateway.history.reader import HistoryReader, StoredDay
 from gateway.history.source import HistorySource
-from tests.history.blocks import WALL, block
+from gateway.history.store import Store
+from tests.history.blocks import LAYOUT, WALL, block, seen
 
 ALL = Selection()
 NEWEST = 1000 + 24 * 99
@@ -180,6 +183,20 @@ def test_times_of_a_controller_rise_whatever_was_estimated(history: Path) -> Non
         times = [day.written_at for day in reader.days(Selection("array-1")) if day.written_at is not None]
     assert len(times) == len(set(times)) == 100
     assert times == sorted(times)
+
+
+@pytest.mark.parametrize("form", list(LogFormat))
+def test_an_export_shows_the_history_of_one_moment(history: Path, form: LogFormat) -> None:
+    whole = text(history, form)
+    with HistoryReader(history) as reader, closing(Store(history, session=2)) as store:
+        counted = rows_to_read(reader, form, ALL)
+        store.shift((1, 2), 5000.0)
+        place = Place("shelter-c", "array-3", 13)
+        other = replace(seen(50, place=place), model="tristar-mppt")  # the first of its model
+        store.keep_ring(other, LAYOUT, {0: block(50)})
+        done: list[int] = []
+        assert "".join(export(reader, form, ALL, "ridge-07", done.append)) == whole
+        assert sum(done) == counted
 
 
 def test_without_a_file_it_says_so(tmp_path: Path) -> None:
