@@ -134,6 +134,7 @@ class HistoryStats:
     devices: dict[int, DeviceHistoryStats] = field(default_factory=dict)  # by unit id
     store_up: bool = True  # False: what was read cannot be stored
     store_errors: Counter[str] = field(default_factory=Counter)  # kind → count
+    moved: int = 0  # how often dates were moved, because the clock was set
 
     def of(self, units: Container[int]) -> HistoryStats:
         """The same for another site, of which these units are as before; the others begin anew."""

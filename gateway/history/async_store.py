@@ -85,14 +85,14 @@ class AsyncStore:
 
     async def call(self, method: Callable[Concatenate[Store, P], T], /, *args: P.args, **kwargs: P.kwargs) -> T:
         """What the method gives; HistoryError when it cannot, after which the store is down or a new one."""
-        store = self._store
+        store, opened = self._store, self.opened
         if store is None:
             raise HistoryError("unwritable", f"{self._directory}: not open")
         try:
             return await self._in_thread(method, store, *args, **kwargs)
         except HistoryError as error:
             async with self._busy:
-                if self._store is store:  # else another caller has seen to it
+                if self._store is store and self.opened == opened:  # else another caller has seen to it
                     await self._replace(store, error)
             raise
 

@@ -171,9 +171,8 @@ class HistoryKeeper:
         began = self._clock.monotonic()
         harvest = Harvest(watch.layout, seen.look.hours, plan.position, plan.staged, watch.most)
         while (read := harvest.next_read()) is not None:
-            wait_s = harvest.ready_at - self._clock.monotonic()
-            if wait_s > 0:
-                await self._sleep(wait_s)
+            await self._mind_the_clock()  # what other harvests dated must not wait for the end of this one
+            await self._sleep_until(harvest.ready_at)
             outcome = await self._ask(watch, read.pdu(watch.device.map, watch.layout), patient=read.count == 1)
             if outcome is None:
                 harvest.crowded()
@@ -193,6 +192,8 @@ class HistoryKeeper:
             return None
         await self._mind_the_clock()
         # The hourmeter went on while the ring was read, and a day may have ended.
+        if watch.opened != self._store.opened:  # the plan is of another file, in which keys are others'
+            raise _Interrupted("store_replaced")
         later = self._look(watch.device)
         if later is None or _who(later) != _who(seen) or later.look.hours < seen.look.hours:
             raise _Interrupted("another_controller" if later else "offline")
@@ -208,6 +209,11 @@ class HistoryKeeper:
         result = _Result(kept, later, ending, whole=not harvest.unread)
         self._harvested(watch, result, began)
         return result
+
+    async def _sleep_until(self, at: float) -> None:
+        wait_s = at - self._clock.monotonic()
+        if wait_s > 0:
+            await self._sleep(wait_s)
 
     async def _ask(self, watch: _Watch, pdu: bytes, *, patient: bool) -> Outcome | None:
         """One background read, however long it waits for idle time; None after CROWDED_S, unless `patient`.
@@ -285,7 +291,11 @@ class HistoryKeeper:
     def _taken(self, watch: _Watch) -> frozenset[int]:
         """The controllers that other devices have."""
         others = (other for watches in self._lines for other in watches if other is not watch)
-        return frozenset(other.controller for other in others if other.controller is not None)
+        return frozenset(
+            other.controller
+            for other in others
+            if other.controller is not None and other.opened == self._store.opened  # a key of the file in use
+        )
 
     def _harvested(self, watch: _Watch, result: _Result, began: float) -> None:
         now = self._clock.monotonic()
@@ -338,6 +348,7 @@ class HistoryKeeper:
             except HistoryError:
                 session.clock_offset = before
                 raise
+            self._stats.moved += 1
             _log.warning("event=history_clock_set step_s=%.0f days_moved=%d", step_s, moved)
 
 

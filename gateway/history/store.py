@@ -6,6 +6,8 @@ Rule 2: what a harvest found is one transaction: days, position, look and the en
 Rule 3: whose ring it is, is decided in that transaction, by what is stored (identity.py).
 Rule 4: a day is dated when it is first stored, because the look is closest then; later only while it has no date,
         or when the gateway's clock was set (`shift`).
+Rule 5: who was in a place last is told by the looks. Where the clock says that a controller was looked at there later
+        than the one that is there now, it was wrong at one of the looks, and the other one's is put before this one's.
 """
 
 from __future__ import annotations
@@ -130,17 +132,22 @@ class Store:
         return kept
 
     def shift(self, keys: Collection[int], step_s: float) -> int:
-        """The gateway's clock was set forward by `step_s`: move the dates this session made; gives how many."""
-        moved = 0
+        """The gateway's clock was set forward by `step_s`: move the dates this session made; gives how many.
+
+        `keys` are the controllers that it looked at, as far as known: those with a day of it are found by that.
+        """
         with explained(self.path), transaction(self._db):
-            for key in keys:
-                cursor = self._db.execute(
-                    "UPDATE day SET written_wall = written_wall + ?, read_wall = read_wall + ? "
-                    "WHERE controller = ? AND session = ?",
-                    (step_s, step_s, key, self._session),
-                )
-                moved += cursor.rowcount
-                self._db.execute("UPDATE controller SET look_wall = look_wall + ? WHERE key = ?", (step_s, key))
+            dated = self._db.execute(
+                "SELECT DISTINCT controller FROM day WHERE session = ?", (self._session,)
+            ).fetchall()
+            moved = self._db.execute(
+                "UPDATE day SET written_wall = written_wall + ?, read_wall = read_wall + ? WHERE session = ?",
+                (step_s, step_s, self._session),
+            ).rowcount
+            self._db.executemany(
+                "UPDATE controller SET look_wall = look_wall + ? WHERE key = ?",
+                [(step_s, key) for key in {*keys, *(key for (key,) in dated)}],
+            )
         return moved
 
     def _controllers(self, model: str) -> list[Known]:
@@ -245,6 +252,10 @@ class Store:
                 None if position is None else position.hourmeter,
                 key,
             ),
+        )
+        self._db.execute(  # rule 5
+            "UPDATE controller SET look_wall = ? WHERE line = ? AND device = ? AND key != ? AND look_wall >= ?",
+            (seen.look.wall - 1.0, seen.place.line, seen.place.device, key, seen.look.wall),
         )
         controller = next(known for known in self._controllers(seen.model) if known.key == key)
         replaced = before.identity if before is not None and before.key != key else None

@@ -10,8 +10,10 @@ import pytest
 
 from gateway.clock import SystemClock
 from gateway.core.stats import HistoryStats
+from gateway.errors import HistoryError
 from gateway.history import async_store as module
 from gateway.history.async_store import AsyncStore
+from gateway.history.store import Store
 
 
 class SlowStore:
@@ -57,3 +59,20 @@ async def test_one_that_is_in_use_is_closed_with_it(slow: type[SlowStore], tmp_p
     assert await store.ready()
     await store.close()
     assert [one.closed for one in slow.made] == [True]
+
+
+def set_aside(directory: Path) -> list[Path]:
+    return list(directory.glob("*.corrupt-*"))
+
+
+async def test_a_damaged_file_that_several_meet_at_once_is_set_aside_once(tmp_path: Path) -> None:
+    def damaged(_store: Store) -> None:
+        raise HistoryError("corrupt", "database disk image is malformed")
+
+    store = AsyncStore(tmp_path, SystemClock(), HistoryStats(), session=1)
+    assert await store.ready()
+    met = await asyncio.gather(*(store.call(damaged) for _ in range(3)), return_exceptions=True)
+    assert [type(error) for error in met] == [HistoryError] * 3
+    assert store.opened == 2
+    await store.close()
+    assert len(set_aside(tmp_path)) == 1

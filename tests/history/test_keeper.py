@@ -16,11 +16,12 @@ from gateway.devices.log import decode_log, split_blocks
 from gateway.devices.model import Space, WordOrder
 from gateway.errors import HistoryError
 from gateway.history.database import FILE_NAME
+from gateway.history.identity import Place
 from gateway.history.session import Session
 from gateway.history.store import Store
 from gateway.simulator.device import SimulatedController
 from gateway.simulator.server import missing
-from tests.history.blocks import HI_LO, LAYOUT, LO_HI, MAP
+from tests.history.blocks import HI_LO, LAYOUT, LO_HI, MAP, seen
 from tests.history.virtual_site import VirtualClock, VirtualGateway, VirtualPort
 
 Row = tuple[Any, ...]
@@ -351,6 +352,51 @@ async def test_a_file_damaged_while_it_is_used_is_replaced_and_filled(
         assert running.stats.store_up
     assert stored(tmp_path) == truth(controller)
     assert set_aside(tmp_path) == 1
+
+
+async def test_a_file_replaced_in_the_middle_of_a_harvest_gives_no_day_to_another_controller(
+    tmp_path: Path, gateway: Gateways, clock: VirtualClock
+) -> None:
+    """Another line found the damage, and stored its own controller first: that has the key now."""
+    controller, other = unit(seed=0), unit(seed=1)
+    elsewhere = Place("shelter-b", "array-9", 19)
+
+    def damaged(_store: Store) -> None:
+        raise HistoryError("corrupt", "database disk image is malformed")
+
+    async with gateway(controller) as running:
+        await running.until(lambda: running.stats.devices[11].harvests)
+        reads = len(log_reads(running))
+        clock.now += 2 * DAY_S
+        while len(log_reads(running)) == reads:
+            await running.run(0.02)
+        with pytest.raises(HistoryError):
+            await running.keeper._store.call(damaged)
+        kept = Store(tmp_path, session=9)
+        hours = max(truth(other)) + 1
+        assert (
+            kept.keep_ring(seen(hours, wall=clock.wall(), place=elsewhere), LAYOUT, ring_of(other)).controller.key == 1
+        )
+        kept.close()
+        await running.until(lambda: running.stats.devices[11].harvests == 2)
+        assert running.stats.store_up
+    assert stored(tmp_path, "array-9") == truth(other)
+    assert stored(tmp_path) == truth(controller)
+
+
+async def test_the_dates_follow_a_clock_that_is_set_while_another_log_is_read(
+    tmp_path: Path, gateway: Gateways, clock: VirtualClock
+) -> None:
+    """The harvest of a long log on a busy line takes hours, and the power may fail before it is over."""
+    async with gateway(unit(seed=0), unit(seed=1, address=2)) as running:
+        await running.until(lambda: running.stats.devices[11].harvests)
+        before = rows(tmp_path, "SELECT max(written_wall) FROM day")[0][0]
+        reads = len(log_reads(running))
+        clock.wall_offset += 5 * DAY_S
+        await running.until(lambda: len(log_reads(running)) >= reads + 3)
+        assert not running.stats.devices[12].harvests
+        assert rows(tmp_path, "SELECT max(written_wall) FROM day")[0][0] == pytest.approx(before + 5 * DAY_S)
+        assert running.stats.moved == 1
 
 
 async def test_the_dates_follow_a_clock_that_is_set(tmp_path: Path, gateway: Gateways, clock: VirtualClock) -> None:

@@ -40,6 +40,22 @@ async def test_they_are_those_of_the_controller_that_is_there_now(tmp_path: Path
     assert [day.hourmeter for day in await newest(tmp_path)] == [24, 48]
 
 
+@pytest.mark.parametrize("step_s", [-400 * 86400.0, -WALL])
+async def test_a_clock_that_stands_before_the_last_look_hides_no_replacement(tmp_path: Path, step_s: float) -> None:
+    """A site without a battery for its clock, in which a controller is replaced before there is the time."""
+    with closing(Store(tmp_path, session=1)) as store:
+        store.keep_ring(seen(HOURS[-1] + 5), LAYOUT, full_ring(HOURS))
+        ring = full_ring([24, 48], volts=11.0)
+        first = store.keep_ring(seen(60, wall=WALL + step_s), LAYOUT, ring)
+        again = store.keep_ring(seen(61, wall=WALL + step_s + HOUR_S), LAYOUT, ring)
+        assert (first.replaced, again.replaced) == ("shelter-a/array-1", None)
+        assert store.counts(PLACE.line, PLACE.device)[0] == 2
+        assert [day.hourmeter for day in await newest(tmp_path)] == [24, 48]
+        back = store.keep_ring(seen(HOURS[-1] + 6, wall=WALL + step_s), LAYOUT, full_ring(HOURS))
+        assert back.controller.identity == "shelter-a/array-1"
+    assert [day.hourmeter for day in await newest(tmp_path)] == HOURS
+
+
 async def test_a_device_that_was_never_harvested_has_none(tmp_path: Path) -> None:
     with closing(Store(tmp_path, session=1)):
         pass

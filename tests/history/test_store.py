@@ -150,6 +150,15 @@ def test_a_clock_that_is_set_moves_the_dates_of_this_run_only(tmp_path: Path, st
     assert rows(tmp_path, "SELECT look_wall FROM controller") == [(WALL + 24 * HOUR_S + 5000.0,)]
 
 
+def test_a_clock_that_is_set_moves_what_nobody_was_told_of_any_more(tmp_path: Path, store: Store) -> None:
+    """A keeper that is ended by a reload while its harvest is stored learns no key."""
+    store.keep_ring(seen(LIVE), LAYOUT, RING)
+    before = dates(tmp_path)
+    assert store.shift((), 5000.0) == 100
+    assert dates(tmp_path) == {hour: pytest.approx(at + 5000.0) for hour, at in before.items()}
+    assert rows(tmp_path, "SELECT look_wall FROM controller") == [(WALL + 5000.0,)]
+
+
 def test_identities_are_unique(tmp_path: Path, store: Store) -> None:
     for n in range(3):
         store.keep_ring(seen(LIVE - n), LAYOUT, full_ring(HOURS[: 90 - n], volts=12.0 - n), whole=True)

@@ -1,4 +1,4 @@
-"""Fills the log table from the history whenever a device's log was harvested; runs until it is cancelled."""
+"""Fills the log table from the history whenever a log was harvested or dates moved; runs until it is cancelled."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ class LogKeeper:
             await self._sleep(CHECK_S)
 
     async def look(self) -> None:
-        """Read the days of the devices whose log was harvested since the last time."""
+        """Read the days of the devices whose log was harvested, or dated anew, since the last time."""
         for device in self._site.devices:
             stats = self._stats.devices.get(device.unit_id)
             if stats is None or stats.days is None:
                 continue
-            state = (stats.days, stats.harvested_at)
+            state = (stats.days, stats.harvested_at, self._stats.moved)
             if self._seen.get(device.unit_id) == state:
                 continue
             try:

@@ -248,6 +248,18 @@ async def test_a_device_is_read_when_its_log_was_harvested(site: Site) -> None:
     assert {each[-2:] for each in walk(LogTail(TABLE, keeper.days))} == {(11, 24), (11, 48)}
 
 
+async def test_a_device_is_read_again_when_its_dates_were_moved(site: Site) -> None:
+    source, stats = Source(), HistoryStats()
+    keeper = LogKeeper(site, source, stats)
+    stats.devices[11] = DeviceHistoryStats(days=1, harvested_at=5.0)
+    source.days["array-1"] = [day(24)]
+    await keeper.look()
+    stats.moved += 1
+    await keeper.look()
+    await keeper.look()
+    assert source.asked == ["shelter-a array-1"] * 2
+
+
 def test_models_that_disagree_about_a_column_are_refused(device_map: DeviceMap) -> None:
     assert device_map.log is not None
     fields = tuple(
