@@ -306,7 +306,10 @@ class Polling:
         item.fresh = True
         item.misses = 0
         device_map = map_of_product(product)
-        if device_map is None or (record.known.product or product) != product:
+        is_another = (record.known.product or product) != product
+        if is_another and product:  # a refusal is no other name
+            record.verified = False
+        if device_map is None or is_another:
             if record.warn(UNKNOWN_MODEL, on=True):
                 log.warning('event=model_unknown device=%s product="%s"', record.device.name, product.replace('"', "'"))
             return

@@ -210,6 +210,29 @@ def test_another_model_in_its_place_is_another_unit_and_its_own_comes_back_whole
     assert before - {(0xE080, 4)} <= blocks_read(line), "what the other unit refused is asked for again"
 
 
+@pytest.mark.parametrize(
+    "other", [Stranger("SS-MPPT-20L"), SimulatedController(TRISTAR, plant=TS_60)], ids=["stranger", "known"]
+)
+def test_another_unit_in_the_place_of_one_that_no_map_knows_is_noticed(other: SimulatedController) -> None:
+    """Nobody saw it go: what it says it is, is all that there is to know it by, and is asked for all the time."""
+    mine = Stranger()
+    line = auto_line(mine)
+    (device,) = line.devices
+    line.run(4.0)
+    assert (device.snapshot.state, set(device.snapshot.warnings)) == (DeviceState.ONLINE, {UNKNOWN_MODEL})
+    line.wire.stations[:] = [other]
+    line.run(15.0)
+    assert device.map is UNKNOWN
+    assert (device.snapshot.state, set(device.snapshot.warnings)) == (
+        DeviceState.STALE,
+        {UNKNOWN_MODEL, IDENTITY_MISMATCH},
+    )
+    assert isinstance(line.ask(device, BATTERY_REGULATION), IdentityUnproven)
+    line.wire.stations[:] = [mine]
+    line.run(70.0)
+    assert (device.snapshot.state, set(device.snapshot.warnings)) == (DeviceState.ONLINE, {UNKNOWN_MODEL})
+
+
 def test_a_unit_that_is_not_the_configured_product_does_not_become_its_model() -> None:
     line = auto_line(SimulatedController(TRISTAR, plant=TS_60), expected=Identity(product="TS-MPPT-45"))
     (device,) = line.devices
