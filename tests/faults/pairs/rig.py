@@ -40,7 +40,7 @@ from gateway.simulator.upstream import Habits, SimulatedServer
 from tests.core.virtual_line import VirtualLine
 from tests.core.virtual_upstream import VirtualUpstream
 from tests.faults.pairs.judge import Asked, Judge, Written, is_whole, prostar
-from tests.faults.pairs.spoilt import Spoilt
+from tests.faults.pairs.spoilt import LATE_S, Spoilt
 from tests.faults.pairs.witness import START, Witness
 
 TARGET, OTHER, NEWCOMER = 1, 2, 3
@@ -459,7 +459,7 @@ class PairRig(Judge):
             self.run(max(0.0, self._events[0][0] - self.now))
         self.spoilt.fates.clear()
         over = self.now
-        self.run(2.0)  # what is under way may be lost already
+        self.run(max(LATE_S.values()) + 2.0)  # what is under way may be lost already
         if not self.until(self.healthy, BACK_S, 0.25):
             raise self.broken(f"not online and fresh {BACK_S} s after all is over: {self._state()}")
         slow = not self.upstream  # else ten minutes of polls of single registers take long to go through
