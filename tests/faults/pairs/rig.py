@@ -128,6 +128,7 @@ class PairRig(Judge):
         self._wanted: tuple[int, ...] = (TARGET, OTHER)
         self._away_since = -1e9  # since when the target's place is empty
         self._shut = 0  # who wants the line closed
+        self._rebuilding = False
         self.traffic = True
         self.line = self._build((TARGET, OTHER), START)
 
@@ -202,6 +203,9 @@ class PairRig(Judge):
         """Stop the line in order, and have one with these devices (None: the same) after a pause, as a reload does."""
         if addresses is not None:
             self._wanted = tuple(addresses)
+        if self._rebuilding:
+            return  # what is under way will have them: reloads come one after the other
+        self._rebuilding = True
         engine = self.engine
         engine.finish()
         until = self.now + 4.0
@@ -224,6 +228,7 @@ class PairRig(Judge):
         self.wire.clear()
         self._build(self._wanted, end)
         engine.step(end)
+        self._rebuilding = False
 
     def place(self, unit: Witness | None) -> None:
         """Have this unit, or none, at the target's address."""
