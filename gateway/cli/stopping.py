@@ -3,6 +3,8 @@
 A handler runs in the main thread, in the middle of whatever that was doing, and a second signal in the middle of
 the first one's handler. So a handler takes no lock (`threading.Event.set` does, and two quick Ctrl-C hang it): it
 writes one byte to a pipe.
+
+Whoever started us may have had signals blocked, and we have that of him: those that are waited for are let through.
 """
 
 from __future__ import annotations
@@ -21,8 +23,10 @@ class Stop:
 
     def __init__(self, signals: Iterable[signal.Signals]) -> None:
         self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        for number in signals:
+        numbers = tuple(signals)
+        for number in numbers:
             signal.signal(number, self._on_signal)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
         with suppress(BlockingIOError):  # the pipe is full of earlier signals
@@ -52,4 +56,5 @@ def stop_event(signals: Iterable[signal.Signals]) -> asyncio.Event:
 
     for number in numbers:
         signal.signal(number, on_signal)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)
     return event

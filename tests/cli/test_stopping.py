@@ -36,6 +36,18 @@ def test_a_signal_ends_the_wait_for_good(stop: Stop) -> None:
     sender.join()
 
 
+def test_a_signal_that_was_blocked_before_ends_the_wait() -> None:
+    before = signal.getsignal(signal.SIGUSR1)
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1})
+    try:
+        stop = Stop([signal.SIGUSR1])
+        os.kill(os.getpid(), signal.SIGUSR1)
+        assert stop.is_set
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        signal.signal(signal.SIGUSR1, before)
+
+
 def test_more_signals_than_a_pipe_holds_change_nothing(stop: Stop) -> None:
     for _ in range(70_000):
         stop._on_signal(signal.SIGUSR1, None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import signal
 import stat
 import sys
 from pathlib import Path
@@ -44,11 +45,18 @@ def folder(tmp_path: Path) -> Path:
 
 
 def run(*arguments: str) -> int:
-    """Exit status of a command."""
+    """Exit status of a command; this process handles signals and prints as before afterwards."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ())
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["prostar-gateway", *arguments])
+        patch.setattr(sys, "stdout", sys.stdout)
+        patch.setattr(sys, "stderr", sys.stderr)
         with pytest.raises(SystemExit) as left:
             main()
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+    signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
     return int(left.value.code or 0)
 
 
